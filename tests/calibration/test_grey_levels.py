@@ -7,7 +7,7 @@ import pytest
 from bracket_making import GAMMA, SRGB, make_bracket, make_dark_jpegs, make_scans
 
 from virest.calibration.bracket_samples import sample_bracket
-from virest.calibration.grey_levels import channel_ends, fairly_inside, grey_bins, pixel_noise, scatter_by_grey
+from virest.calibration.grey_levels import channel_ends, grey_bins, pixel_noise, reliably_inside, scatter_by_grey
 from virest.calibration.response_curve import curve_distance_levels, fit_response
 from virest.camera.response import ResponseCurve
 
@@ -47,7 +47,7 @@ def test_scanned_film_whose_channels_end_apart_has_a_curve(rng: np.random.Genera
 def test_channels_of_an_ordinary_bracket_have_common_ends(rng: np.random.Generator) -> None:
     """Colours of the scene are no ends: nothing is brought anywhere."""
     samples = sample_bracket(make_bracket(GAMMA, rng), rng)
-    assert not samples.ends.apart
+    assert not samples.ends.differ
 
 
 def test_ends_are_found_where_greys_rest(rng: np.random.Generator) -> None:
@@ -60,9 +60,9 @@ def test_ends_are_found_where_greys_rest(rng: np.random.Generator) -> None:
     ends = channel_ends(means, exposure)
     np.testing.assert_allclose(ends.black, black, atol=1.0)
     np.testing.assert_allclose(ends.white, white, atol=0.5)
-    rests = ends.levelled(means)[:, -1].max(axis=1)
+    rests = ends.equalised(means)[:, -1].max(axis=1)
     assert np.ptp(rests) < 1.5
-    assert (ends.levelled(np.array([[0.0, 255.0]] * 3)) == [0.0, 255.0]).all()
+    assert (ends.equalised(np.array([[0.0, 255.0]] * 3)) == [0.0, 255.0]).all()
 
 
 def test_noise_is_a_table_by_grey_and_channel(rng: np.random.Generator) -> None:
@@ -98,6 +98,6 @@ def test_noise_does_not_decide_what_is_dark(rng: np.random.Generator) -> None:
     light = np.linspace(0.0, 20.0, 2000)[:, None]
     grey = light + rng.normal(0, 1.0, light.shape)
     limits = np.full((2000, 1), 8.0), np.full((2000, 1), 250.0)
-    fair = fairly_inside(grey, light, limits, np.ones(light.shape))
+    fair = reliably_inside(grey, light, limits, np.ones(light.shape))
     assert not fair[light[:, 0] < 9.0].any()
     assert fair[light[:, 0] > 11.0].all()

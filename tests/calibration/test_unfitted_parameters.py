@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from virest.calibration.calibrated_values import held_back, value_of
+from virest.calibration.calibrated_values import reset_undetermined, value_of
 from virest.calibration.unfitted_parameters import OPTIONAL, HeldValue, held_notes
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
@@ -36,7 +36,7 @@ def test_what_is_not_determined_goes_back_to_where_it_was() -> None:
     )  # fmt: skip
     fit, start = SimpleNamespace(profile=found), replace(given, r_cam_imu=turned[::-1])
     names = ("time_offset", "readout_time", "imu_rotation", "focal_length", "gyro_scale", "clock_skew")
-    held = held_back(fit, given, start, dict.fromkeys(names, False) | {"principal_point": True})  # type: ignore[arg-type]
+    held = reset_undetermined(fit, given, start, dict.fromkeys(names, False) | {"principal_point": True})  # type: ignore[arg-type]
     assert held.shutter == given.shutter
     assert held.time_offset_s == pytest.approx(0.02 + 0.5 * (0.03 - given.shutter.readout_time_s))
     assert held.r_cam_imu == start.r_cam_imu

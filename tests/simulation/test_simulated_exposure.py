@@ -111,7 +111,7 @@ def test_moving_right_before_a_plane_shifts_the_picture_left():
     scene = spot_scene(depth_m=2.0)
     places = []
     for x in (0.0, 0.1):
-        motion = constant_motion((0.0, 0.0, 0.0), velocity_free_position_m=(x, 0.0, 0.0))
+        motion = constant_motion((0.0, 0.0, 0.0), position_m=(x, 0.0, 0.0))
         places.append(centroid_px(instant(scene, motion, make_view(camera(), motion), 0.0)))
     assert places[1] - places[0] == pytest.approx([-5.0, 0.0], abs=0.02)
 

@@ -1,1 +1,1 @@
-"""Fit the phone: what its pictures say about its response curve and its geometry."""
+"""Calibration of a phone from its own recordings: response curve and geometry."""

@@ -1,11 +1,11 @@
-"""From a bracket of pictures to samples: the same places of the scene, seen at every exposure.
+"""Sample an exposure bracket: grey levels of the same scene locations at every exposure.
 
-Pictures are aligned by what exposure does not change, the rank of each pixel among its picture's greys (in the manner
-of Ward 2003, "Fast, robust image registration for compositing high dynamic range photographs from hand-held exposures",
-doi:10.1080/10867651.2003.10487583, whose median threshold bitmaps are ranks of one bit).  Samples are means over small
-flat squares, spread over the picture and over its brightnesses; squares on edges are left out, since there the smallest
-misalignment counts as light.  Black, white and noise are each channel's own (``grey_levels``); beyond them the channels
-are pooled: one curve stands for all, as in the camera profile.
+Pictures are aligned by what exposure does not change, the rank of each pixel among the picture's grey levels (after
+Ward 2003, "Fast, robust image registration for compositing high dynamic range photographs from hand-held exposures",
+doi:10.1080/10867651.2003.10487583, whose median threshold bitmaps are one-bit ranks).  Samples are means over small
+flat squares, spread over the picture and over its range of brightness.  Squares on edges are excluded, since there the
+smallest misalignment looks like a change of light.  Black, white and noise are measured per channel (``grey_levels``);
+otherwise the channels are pooled, since the camera profile has one curve.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from virest.calibration.grey_levels import (
     ChannelEnds,
     GreyNoise,
     channel_ends,
-    of_means,
+    mean_noise,
     pixel_noise,
 )
 from virest.errors import CalibrationError
@@ -32,66 +32,68 @@ from virest.errors import CalibrationError
 Array = NDArray[np.float64]
 MAX_SHIFT_PX = 8.0
 MIN_GAIN = 0.2
-"""A shift counts if it takes this share of the difference between two pictures away."""
+"""Minimum fraction of the squared difference between two pictures that a shift must remove to be accepted."""
 RIGID_PX = 1.5
-STEEPEST = 4 / 256
+"""Maximum relative motion of the quarters of a picture."""
+MAX_LEVEL_SHARE = 4 / 256
+"""Fraction of the pixels at one grey level above which ranks are compressed."""
 CANDIDATES = 9000
 SITES = 900
 MIN_SITES = 40
 PILE = 0.02
-"""Share of the samples within the noise of the darkest or brightest that makes it a place where greys pile up."""
+"""Minimum fraction of samples within the noise of the darkest or brightest grey for that grey to be a clip level."""
 ABOVE_PILE = 0.1
-"""Greys brighter than a pile that is the curve's end are fewer than this share of it."""
+"""Greys brighter than a plateau are fewer than this fraction of those on it."""
 MIN_SHARED = 25
-"""Samples that two pictures must both see unclipped, so that their exposures can be compared."""
+"""Minimum samples unclipped in both of two pictures for their exposures to be compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class BracketPicture:
-    """One picture, as listed."""
+    """One picture of the bracket."""
 
     file: str
     levels: NDArray[Any]
     """(h, w, 3), 0 to 255."""
     exposure: float
-    """Listed light, in any unit that the bracket shares."""
+    """Listed exposure, in any unit common to the bracket."""
 
 
 @dataclass(frozen=True)
 class BracketSamples:
-    """Greys of the same places in every picture."""
+    """Greys of the same sites in every picture."""
 
     grey: Array
     """(samples, pictures), mean levels of small squares, 0 to 255."""
     site: NDArray[np.int64]
-    """(samples,) which place of the picture; the channels of one place share it."""
+    """(samples,) site index; the channels of one site share it."""
     channel: NDArray[np.int64]
     """(samples,) 0, 1, 2."""
     exposure: Array
-    """(pictures,) listed light."""
+    """(pictures,) listed exposure."""
     lows: Array
-    """(channels,) greys at or below are censored: black, or noise cut off there."""
+    """(channels,) greys at or below are censored: black, or noise clipped at black."""
     highs: Array
     """(channels,) greys at or above are censored: clipped, or on the curve's plateau."""
     top: float
-    """The brightest grey seen, robustly."""
+    """Brightest grey seen (robust)."""
     noise: GreyNoise
-    """Of a sample."""
+    """Noise of a sample."""
     shifts_px: Array
-    """(pictures, 2) how far the scene lies to the right and below of where the first picture has it."""
+    """(pictures, 2) shift of the scene, right and down, relative to the first picture."""
     ends: ChannelEnds
-    """Black and white of each channel, before the greys were brought to common ones."""
-    fair: NDArray[np.bool_] | None = None
-    """(samples, pictures): where noise does not decide whether a grey lies between the limits; None: not told yet."""
+    """Black and white of each channel, before the channels were equalised."""
+    reliable: NDArray[np.bool_] | None = None
+    """(samples, pictures) greys whose position between the limits is not decided by noise; None: not yet assessed."""
 
     @property
     def low(self) -> float:
-        """The darkest grey that is measured in any channel."""
+        """Lower censoring limit of the darkest channel."""
         return float(self.lows.min())
 
     @property
     def high(self) -> float:
-        """The brightest grey that is measured in any channel."""
+        """Upper censoring limit of the brightest channel."""
         return float(self.highs.max())
 
     @cached_property
@@ -101,10 +103,10 @@ class BracketSamples:
 
     @cached_property
     def measured(self) -> NDArray[np.bool_]:
-        """(samples, pictures): not censored."""
+        """(samples, pictures): neither censored nor unreliable."""
         low, high = self.limits
         inside = (self.grey > low) & (self.grey < high)
-        return inside if self.fair is None else inside & self.fair
+        return inside if self.reliable is None else inside & self.reliable
 
     @cached_property
     def sigma(self) -> Array:
@@ -112,33 +114,33 @@ class BracketSamples:
         return np.sqrt(self.noise.at(self.grey, self.channel))
 
     def take(self, rows: NDArray[Any]) -> BracketSamples:
-        """Some of the samples."""
-        fair = None if self.fair is None else self.fair[rows]
-        return replace(self, grey=self.grey[rows], site=self.site[rows], channel=self.channel[rows], fair=fair)
+        """Select samples."""
+        reliable = None if self.reliable is None else self.reliable[rows]
+        return replace(self, grey=self.grey[rows], site=self.site[rows], channel=self.channel[rows], reliable=reliable)
 
     def by_light(self) -> BracketSamples:
-        """The same from dark to bright, picture after picture in memory: tables are read six times as fast in order."""
+        """Sort from dark to bright, contiguous per picture: look-ups in sorted order are six times as fast."""
         ordered = self.take(np.argsort(self.grey.mean(axis=1)))
         return replace(ordered, grey=np.asfortranarray(ordered.grey))
 
     def without(self, picture: int) -> BracketSamples:
-        """All samples, as if one picture had measured none of them."""
-        fair = np.ones(self.grey.shape, bool) if self.fair is None else self.fair.copy()
-        fair[:, picture] = False
-        return replace(self, fair=fair)
+        """All samples, with those of one picture marked as not measured."""
+        reliable = np.ones(self.grey.shape, bool) if self.reliable is None else self.reliable.copy()
+        reliable[:, picture] = False
+        return replace(self, reliable=reliable)
 
     def keep_pictures(self, keep: NDArray[Any]) -> BracketSamples:
-        """Some of the pictures."""
-        fair = None if self.fair is None else self.fair[:, keep]
+        """Select pictures."""
+        reliable = None if self.reliable is None else self.reliable[:, keep]
         grey, shifts_px = self.grey[:, keep], self.shifts_px[keep]
-        return replace(self, grey=grey, exposure=self.exposure[keep], shifts_px=shifts_px, fair=fair)
+        return replace(self, grey=grey, exposure=self.exposure[keep], shifts_px=shifts_px, reliable=reliable)
 
 
 def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator) -> BracketSamples:
     """Align the pictures and sample them.
 
-    Raises CalibrationError where they are shifted by more than MAX_SHIFT_PX or not rigidly, have no flat places, or
-    are clipped throughout.
+    Raises CalibrationError if they are shifted by more than MAX_SHIFT_PX or not rigidly, are too small, have too few
+    flat sites that overlap in exposure, or are clipped throughout.
     """
     shifts_px = align_pictures(pictures)
     height, width = pictures[0].levels.shape[:2]
@@ -148,8 +150,8 @@ def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator)
     means, variances = _squares(pictures, centres, shifts_px, half, channels)
     exposure = np.array([p.exposure for p in pictures], np.float64)
     ends = channel_ends(means, exposure)
-    if ends.apart:
-        means, variances = ends.levelled(means), variances * (ends.gain**2)[:, None, None]
+    if ends.differ:
+        means, variances = ends.equalised(means), variances * (ends.gain**2)[:, None, None]
     pixels = (2 * half + 1) ** 2
     by_pixel = pixel_noise(means, variances, pixels)
     lows, highs, top = _limits(means, by_pixel)
@@ -157,7 +159,7 @@ def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator)
     if not measured.any(axis=1).any():
         text = f"all {len(pictures)} pictures are clipped throughout"
         raise CalibrationError(text, hint="take exposures at which the scene is neither black nor white")
-    noise = of_means(by_pixel, pixels)
+    noise = mean_noise(by_pixel, pixels)
     keep = _flat_sites(means, variances, measured, noise, pixels)
     chosen = _spread_sites(means[:, :, keep], keep, rng)
     grey = means[:, :, chosen].transpose(2, 0, 1).reshape(-1, len(pictures))
@@ -166,7 +168,7 @@ def sample_bracket(pictures: Sequence[BracketPicture], rng: np.random.Generator)
     samples = BracketSamples(grey, site, channel, exposure, lows, highs, top, noise, shifts_px, ends)
     seen = samples.measured.sum(axis=1) >= 2
     if len(np.unique(site[seen])) < MIN_SITES:
-        text = f"only {len(np.unique(site[seen]))} flat places are unclipped in two pictures, {MIN_SITES} are needed"
+        text = f"only {len(np.unique(site[seen]))} flat areas are unclipped in two pictures, {MIN_SITES} are needed"
         raise CalibrationError(f"no overlap: {text}", hint="take exposures closer together, of a scene with flat areas")
     return samples.take(seen)
 
@@ -177,21 +179,21 @@ def _is_grey(pictures: Sequence[BracketPicture]) -> bool:
 
 
 def _candidates(height: int, width: int, margin: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Places on a jittered grid, (n, 2) x y."""
+    """Candidate sites on a jittered grid, (n, 2), x y."""
     if min(height, width) < 2 * margin + 8:
         raise CalibrationError(f"pictures of {width}x{height} px are too small", hint="take larger ones")
     step = max(2.0 * (margin > 3) + 1.0, np.sqrt(height * width / CANDIDATES))
     grid = np.stack(np.meshgrid(np.arange(margin, width - margin, step), np.arange(margin, height - margin, step)), -1)
-    places = grid.reshape(-1, 2) + rng.uniform(0, step, (grid.shape[0] * grid.shape[1], 2))
-    return np.clip(places, margin, [width - margin - 1, height - margin - 1]).astype(np.int64)
+    sites = grid.reshape(-1, 2) + rng.uniform(0, step, (grid.shape[0] * grid.shape[1], 2))
+    return np.clip(sites, margin, [width - margin - 1, height - margin - 1]).astype(np.int64)
 
 
 def _squares(
     pictures: Sequence[BracketPicture], centres: NDArray[np.int64], shifts_px: Array, half: int, channels: int
 ) -> tuple[Array, Array]:
-    """Mean and variance of the square round each place, (channels, pictures, places).
+    """Mean and variance of the square around each site, (channels, pictures, sites).
 
-    A square with a pixel at 0 or 255 counts as 0 or 255 whole, so that it is censored.
+    A square with any pixel at 0 or 255 gets the mean 0 or 255, so that it is censored.
     """
     span = np.arange(-half, half + 1)
     means = np.empty((channels, len(pictures), len(centres)))
@@ -209,8 +211,8 @@ def _squares(
 def _limits(means: Array, noise: GreyNoise) -> tuple[Array, Array, float]:
     """Censoring limits of each channel, and the brightest grey seen.
 
-    means: (channels, pictures, places); noise: of a pixel.  Where noise is cut off at black, the mean of what is left
-    is too bright: greys within CUT_SIGMA of it say nothing.
+    means: (channels, pictures, sites).  noise: of a pixel.  Noise clipped at black biases means upwards, so greys
+    within CUT_SIGMA of black are censored, and likewise near white.
     """
     bottom, top = (float(v) for v in np.quantile(means, [0.001, 0.999]))
     dark, bright = (CUT_SIGMA * np.sqrt(noise.variance[:, end]) for end in (0, -1))
@@ -223,35 +225,38 @@ def _limits(means: Array, noise: GreyNoise) -> tuple[Array, Array, float]:
 
 
 def _plateau(means: Array, margin: float) -> float:
-    """The bright grey at which greys pile up with next to nothing above it; 255 without such a pile.
+    """Grey level of the curve's upper plateau: a peak of the histogram with little above it; 255 if there is none.
 
-    A curve may end below 255, and what a movie's codec adds at edges there still reach 255: no quantile finds the end.
+    A curve may end below 255 while ringing of the codec at edges still reaches 255, so no quantile finds its end.
     """
     counts = np.bincount(np.rint(means).ravel().astype(np.int64), minlength=256)
     reach = int(np.ceil(margin))
     pile = np.convolve(counts, np.ones(2 * reach + 1), "same")
-    place = 128 + int(np.argmax(pile[128:]))
-    lonely = counts[place + reach + 1 :].sum() < ABOVE_PILE * pile[place]
-    if pile[place] < PILE * means.size or not lonely:
+    peak = 128 + int(np.argmax(pile[128:]))
+    little_above = counts[peak + reach + 1 :].sum() < ABOVE_PILE * pile[peak]
+    if pile[peak] < PILE * means.size or not little_above:
         return 255.0
-    return float(np.median(means[np.abs(means - place) <= reach + 0.5]))
+    return float(np.median(means[np.abs(means - peak) <= reach + 0.5]))
 
 
 def _flat_sites(
     means: Array, variances: Array, measured: NDArray[np.bool_], noise: GreyNoise, pixels: int
 ) -> NDArray[np.int64]:
-    """Indices of the flatter half of the places, judged where they are not clipped, against the noise there."""
+    """Indices of the flatter half of the sites, and of all with at most twice the noise variance.
+
+    Flatness is the largest ratio of variance to expected noise over the greys that are not clipped.
+    """
     expected = pixels * noise.at(means, np.arange(len(means)))
     excess = np.where(measured, variances / expected, 0.0).max(axis=(0, 1))
     seen = np.flatnonzero((measured.sum(axis=1) >= 2).any(axis=0))
     if not len(seen):
-        text = "no place is unclipped in two pictures"
+        text = "no area is unclipped in two pictures"
         raise CalibrationError(f"no overlap: {text}", hint="take exposures closer together, at most 3 EV apart")
     return seen[excess[seen] <= max(np.quantile(excess[seen], 0.5), 2.0)]
 
 
 def _spread_sites(means: Array, keep: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-    """SITES of the places, as many from each of 24 classes of brightness as there are."""
+    """Choose up to SITES sites, as evenly as possible over 24 classes of brightness."""
     brightness = means.mean(axis=(0, 1))
     edges = np.linspace(brightness.min(), brightness.max() + 1e-6, 25)
     classes = np.digitize(brightness, edges)
@@ -267,10 +272,11 @@ def _spread_sites(means: Array, keep: NDArray[np.int64], rng: np.random.Generato
 
 
 def align_pictures(pictures: Sequence[BracketPicture]) -> Array:
-    """(pictures, 2): how far each picture's scene is shifted right and down against the first picture's, in pixels.
+    """Shift (pictures, 2) of each picture's scene, right and down, relative to the first picture, in pixels.
 
-    Neighbours in exposure are compared by rank within the greys that neither clips; a shift counts where it explains
-    the difference.  Raises CalibrationError beyond MAX_SHIFT_PX, and where parts of the picture move differently.
+    Neighbours in exposure are compared by rank within the greys that neither clips; a shift is accepted if it explains
+    the difference.  Raises CalibrationError beyond MAX_SHIFT_PX from the median, and if parts of a picture move
+    differently.
     """
     order = np.argsort([p.exposure for p in pictures], kind="stable")
     shifts = np.zeros((len(pictures), 2))
@@ -302,9 +308,10 @@ def _small_green(levels: NDArray[Any], step: int) -> NDArray[Any]:
 
 
 def _shift_between(first: NDArray[Any], second: NDArray[Any], first_name: str, second_name: str) -> Array:
-    """Shift (x, y) of the second picture against the first, in their pixels; zero where there is nothing to see.
+    """Shift (x, y) of the second picture relative to the first, in their pixels; zero without usable structure.
 
-    A part moves by itself where a shift of its own explains much of what the common shift leaves there.
+    Raises CalibrationError if quarters of the picture move relative to each other: a quarter's own shift counts if it
+    explains much of the difference that the common shift leaves.
     """
     pair = _common_ranks(first, second)
     if pair is None:
@@ -329,10 +336,10 @@ def _quarters(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
 
 
 def _common_ranks(first: NDArray[Any], second: NDArray[Any]) -> tuple[Any, Any] | None:
-    """Both pictures as ranks in [0, 1], held within what neither clips; None where that is next to nothing.
+    """Both pictures as ranks in [0, 1], limited to the range that neither clips; None if less than 5 % remains.
 
-    Ranks spread the noise of a flat area over as much of [0, 1] as the area fills of the picture.  So ranks where a
-    grey level holds more than STEEPEST of the pixels are drawn together.
+    Ranks spread the noise of a flat area over the same fraction of [0, 1] as the area occupies of the picture.  Ranks
+    are therefore compressed where one grey level holds more than MAX_LEVEL_SHARE of the pixels.
     """
     shares = [np.cumsum(np.bincount(p.ravel(), minlength=256)) / p.size for p in (first, second)]
     low = max(share[min(int(np.searchsorted(share, 0.001)) + 4, 255)] for share in shares)
@@ -340,9 +347,9 @@ def _common_ranks(first: NDArray[Any], second: NDArray[Any]) -> tuple[Any, Any] 
     if high - low < 0.05:
         return None
     rank = np.linspace(low, high, 512)
-    # one function of rank for both: what lies beyond the limit of steepness in either picture counts less in both
+    # one mapping of rank for both pictures: ranks compressed in either are compressed in both
     crowd = np.max([np.diff(share, prepend=0.0)[np.searchsorted(share, rank).clip(0, 255)] for share in shares], axis=0)
-    value = np.cumsum(np.minimum(1.0, STEEPEST / np.maximum(crowd, 1e-9)))
+    value = np.cumsum(np.minimum(1.0, MAX_LEVEL_SHARE / np.maximum(crowd, 1e-9)))
     value = (value - value[0]) / (value[-1] - value[0])
     ranks = []
     for picture, share in zip((first, second), shares, strict=True):
@@ -352,13 +359,13 @@ def _common_ranks(first: NDArray[Any], second: NDArray[Any]) -> tuple[Any, Any] 
 
 
 def _moved(picture: Any, shift: Array) -> Any:
-    """The picture with its content moved back by a shift (x, y); the border is repeated."""
+    """Move the picture's content back by a shift (x, y), replicating the border."""
     return cv2.warpAffine(picture, np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32), picture.shape[::-1],
                           flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
 
 
 def _tested_shift(first: Any, second: Any) -> tuple[Array, float]:
-    """Shift (x, y) by phase correlation and the share of the squared difference that it takes away."""
+    """Shift (x, y) by phase correlation, and the fraction of the squared difference that it removes."""
     size = (first.shape[1], first.shape[0])
     (dx, dy), _ = cv2.phaseCorrelate(first, second, cv2.createHanningWindow(size, cv2.CV_32F))
     margin = int(min(np.ceil(max(abs(dx), abs(dy))) + 1, min(first.shape) // 3))

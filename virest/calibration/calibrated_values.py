@@ -1,4 +1,4 @@
-"""The values that a calibration prints and writes: which are known well enough, and what happens to the others."""
+"""Values that a calibration reports and writes: which are determined well enough, and how the others are handled."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ from virest.inference.track_fit import TrackFit
 
 Array = NDArray[np.float64]
 MIN_STRETCHES = 2.5
-"""A value that rests on fewer stretches of time is a single moment's, and nothing else bears it out."""
+"""A value must be supported by this effective number of time blocks; with fewer, nothing confirms it."""
 LARGE_CORRELATION = 0.9
 NO_FINDING = "no camera has it"
 ROUGH_OFFSET_S = 0.01
-"""An offset known to this is written, and said to be rough; what is worse tells less than a phone's usual clocks do."""
+"""A time offset with at most this standard deviation is written as rough; a worse one is no better than a default."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibratedValue:
-    """One value of the profile, before and after."""
+    """One profile value before and after calibration."""
 
     name: str
     """As in the profile: time_offset_s, readout_time_s, readout_direction, rotation_rad, gyro_bias_rad_s, fx_px ..."""
     start: float | list[float] | str | None
     value: float | list[float] | str | None
-    """Fitted; the start where not determined."""
+    """Fitted value; the start value if not determined."""
     std: float | list[float] | None
     determined: bool
     note: str = ""
     rough: bool = False
-    """Not determined as well as is wanted, and written all the same, with its deviation."""
+    """Less precise than required, but written with its standard deviation."""
     implausible: bool = False
-    """The fit gave a value that no camera has: left at its start."""
+    """The fitted value is physically impossible; the start value is kept."""
 
 
 def calibrated(effect: str) -> Calibrated:
-    """What the table of effects says of the value that a term of this name is fitted to."""
+    """Calibration entry of an effect in the table of effects."""
     found = EFFECTS[effect].calibrated
     assert found is not None
     return found
 
 
 def beyond_limits(fit: TrackFit, observed: ObservedTracks) -> dict[str, str]:
-    """Of the fitted terms, those whose values no camera has, and why."""
+    """Fitted terms with physically impossible values, and the reason for each."""
     stamps = observed.stamp_s[np.isfinite(observed.stamp_s)]
     period_s, fitted = float(np.median(np.diff(stamps))), right_way_round(fit.profile)
     reasons = limit_reasons(fitted, period_s, float(np.median(observed.exposure_s)))
@@ -60,7 +60,10 @@ def beyond_limits(fit: TrackFit, observed: ObservedTracks) -> dict[str, str]:
 
 
 def is_determined(fit: TrackFit, name: str, variance: Array) -> bool:
-    """Known well enough, and not by a single moment alone; a readout within two deviations of 0 has no known sense."""
+    """Whether a term is precise enough and supported by enough time blocks.
+
+    A readout within two standard deviations of 0 is not determined, since its direction is unknown.
+    """
     known = bool(np.all(np.sqrt(variance) <= calibrated(name).max_std))
     if name == "readout_time" and abs(fit.profile.shutter.readout_time_s) < 2 * float(np.sqrt(variance[0])):
         return False
@@ -68,7 +71,7 @@ def is_determined(fit: TrackFit, name: str, variance: Array) -> bool:
 
 
 def roughly_known(offset: CalibratedValue, fit: TrackFit) -> CalibratedValue:
-    """An offset that is known roughly, by more than a single moment, says so."""
+    """Mark an undetermined time offset as rough if it is known to ROUGH_OFFSET_S from enough time blocks."""
     std_s = float(np.max(np.asarray(offset.std, float)))
     if offset.determined or std_s > ROUGH_OFFSET_S or fit.stretches[fit.slices["time_offset"]][0] < MIN_STRETCHES:
         return offset
@@ -76,7 +79,10 @@ def roughly_known(offset: CalibratedValue, fit: TrackFit) -> CalibratedValue:
 
 
 def variances_of(fit: TrackFit, bias: dict[str, Array], drift: tuple[float, float]) -> dict[str, Array]:
-    """Variance of each term's values, with what remains of tracking's bias; the offset is that of the first row."""
+    """Variance of each term's values, including residual tracking bias; the time offset refers to the first row.
+
+    bias: standard deviation by term.  drift: (rad, s) as from the accelerometer's noise; it adds to rotation and bias.
+    """
     found = {term.name: fit.std(term.name) ** 2 + bias[term.name] ** 2 for term in fit.terms}
     found["imu_rotation"] = found["imu_rotation"] + (0.5 * drift[0]) ** 2
     found["gyro_bias"] = found["gyro_bias"] + (drift[0] / drift[1]) ** 2
@@ -87,8 +93,10 @@ def variances_of(fit: TrackFit, bias: dict[str, Array], drift: tuple[float, floa
     return found
 
 
-def held_back(fit: TrackFit, given: CameraProfile, start: CameraProfile, determined: dict[str, bool]) -> CameraProfile:
-    """The fitted profile, with what is not determined put back to where it began: axes to those found coarsely."""
+def reset_undetermined(
+    fit: TrackFit, given: CameraProfile, start: CameraProfile, determined: dict[str, bool]
+) -> CameraProfile:
+    """The fitted profile with undetermined values reset to ``given``, the IMU axes to the coarse ones in ``start``."""
     profile, before = fit.profile, replace(given, r_cam_imu=start.r_cam_imu)
     for name in (name for name, known in determined.items() if not known):
         profile = calibrated(name).keep(profile, before)
@@ -103,7 +111,7 @@ def value_of(
     variance: Array,
     determined: bool,
 ) -> CalibratedValue:
-    """One value; fitted: the profile with what is not determined too, which turns relative deviations into units."""
+    """Build one value.  fitted: profile with all fitted values, used to convert relative deviations to units."""
     shown = calibrated(name)
     std = np.sqrt(variance)
     before, after = shown.read(given), shown.read(profile)
@@ -118,14 +126,14 @@ def value_of(
 
 
 def direction_value(given: CameraProfile, profile: CameraProfile, known: bool) -> CalibratedValue:
-    """The readout's direction, a word."""
+    """The readout direction, as a word."""
     return CalibratedValue(
         "readout_direction", given.shutter.readout_direction, profile.shutter.readout_direction, None, known
     )
 
 
 def with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) -> CameraProfile:
-    """The profile with its estimates: of values that are known well, or roughly."""
+    """Add the estimates of determined and rough values to the profile."""
     source = "tracked points against the inertial data"
     for value in values:
         if (value.determined or value.rough) and value.value is not None:
@@ -135,7 +143,7 @@ def with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) ->
 
 
 def correlations_of(fit: TrackFit, variances: dict[str, Array]) -> tuple[tuple[str, str, float], ...]:
-    """Pairs of values whose errors go together, and how far."""
+    """Pairs of values with correlated errors (|ρ| > LARGE_CORRELATION), and their correlation."""
     names = [
         f"{calibrated(t.name).name}{'' if len(t) == 1 else '[' + str(k) + ']'}"
         for t in fit.terms

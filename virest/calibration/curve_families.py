@@ -1,7 +1,7 @@
-"""The kinds of curve that a fit can choose from, each by a few numbers without constraints between them.
+"""Kinds of response curve that a fit can choose from, each with a few independent parameters.
 
 The exposure axis has no absolute scale, so each family fixes its own: full grey at 1 for ``linear``, ``srgb`` and
-``gamma``, slope 1 of the line for ``five_segment``, 1 at the brightest grey covered for ``table``.
+``gamma``; unit slope of the line for ``five_segment``; 1 at the brightest grey covered for ``table``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TABLE_LEVELS = 96
 SMALLEST_LIGHT = 1e-7
 FIT_LEVELS = 384
 FULL_LEVEL = 253.8
-"""A brightest grey above is the 8 bits' own end, not the curve's plateau."""
+"""A brightest grey above this is the end of the 8-bit range, not the curve's plateau."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,20 +32,23 @@ class Family:
 
     kind: str
     start: Array
-    """Parameters to begin with."""
+    """Start parameters."""
     lower: Array
     upper: Array
     build: Callable[[Array], ResponseCurve]
     smoothness: Callable[[Array], Array] | None = None
-    """Changes of the curve's local exponent from knot to knot: what a fit holds small where the data say nothing."""
+    """Changes of the local exponent from knot to knot, penalised by the fit."""
     bends: bool = False
-    """Whether the parameters can raise the curve to a power, as a trend of the exposures' errors would."""
+    """Whether the parameters can raise the curve to a power, which a trend of the exposure errors would also do."""
     others: tuple[Array, ...] = ()
-    """Further parameters to begin with; the best after a few steps is followed."""
+    """Alternative start parameters; the fit continues from the best after a few iterations."""
 
 
 def make_family(kind: str, first: FirstCurve, low: float, high: float, top: float) -> Family:
-    """A family with parameters started from a first curve; low, high, top: grey levels censored, and seen at most."""
+    """A family with start parameters from a first curve.
+
+    low, high: censoring limits in grey levels; top: brightest grey seen.
+    """
     match kind:
         case "gamma":
             slope = np.polyfit(np.log(first.grey[3:] / 255), first.log_light[3:], 1)[0]
@@ -68,7 +71,7 @@ def _gamma_curve(p: Array) -> ResponseCurve:
 
 
 def five_segment_curve(p: Array) -> ResponseCurve:
-    """p = (x_b, y_b, share of the way from y_b to y_d at which the line ends, y_d); the line has slope 1."""
+    """p = (x_b, y_b, fraction of the range y_b to y_d at which the line ends, y_d); the line has slope 1."""
     xb, yb, share, top = (float(v) for v in p)
     top = min(max(top, yb + 0.02), 1.0)
     yc = min(yb + (top - yb) * share, top)
@@ -91,7 +94,7 @@ def _five_segment(first: FirstCurve, high: float, top: float) -> Family:
         lo, hi = np.append(lower, -6.0), np.append(upper, 6.0)
         begin = np.clip(np.append(guess, np.log(max(rise, 0.01))), lo + 1e-7, hi - 1e-7)
         found = least_squares(miss, begin, bounds=(lo, hi), max_nfev=25).x[:4]
-        # off the bounds, where a trust region would creep
+        # away from the bounds, where a trust-region solver converges slowly
         inside = np.array([1e-7, 0.01, 0.02, 1e-7])
         starts.append(np.clip(found, lower + inside, upper - inside))
     return Family("five_segment", starts[0], lower, upper, five_segment_curve, others=tuple(starts[1:]))
@@ -114,7 +117,7 @@ def _table(first: FirstCurve, low: float, high: float, top: float) -> Family:
 
 
 def table_curve(p: Array, greys: Array, top: float) -> ResponseCurve:
-    """Monotone table through greys (levels) whose log exposures rise by exp(p); 1 at the last, ends extended."""
+    """Monotone table through greys (levels) with log-exposure increments exp(p); 1 at the last, ends extrapolated."""
     log_light = np.concatenate([[0.0], np.cumsum(np.exp(p))])
     log_light -= log_light[-1]
     levels = greys[0] + (greys[-1] - greys[0]) * np.linspace(0, 1, TABLE_LEVELS) ** 1.4
@@ -133,13 +136,13 @@ def table_curve(p: Array, greys: Array, top: float) -> ResponseCurve:
 
 @dataclass(frozen=True, slots=True)
 class LogLookup:
-    """Grey level over the logarithm of light and back, for tens of thousands of pixels at a time.
+    """Look-up tables between log light and grey level, for tens of thousands of pixels at a time.
 
-    Values (samples, pictures) are looked up picture by picture: samples in their order of light are found the soonest.
+    Values (samples, pictures) are looked up picture by picture; samples sorted by light are fastest.
     """
 
     log_light: Array
-    """(m,) rising."""
+    """(m,) increasing."""
     grey: Array
     """(m,) levels."""
     slope: Array
@@ -159,7 +162,7 @@ class LogLookup:
 
 
 def log_lookup(curve: ResponseCurve) -> LogLookup:
-    """Tabulate a curve, denser at its dark and at its bright end."""
+    """Tabulate a curve, more densely at its dark and bright ends."""
     low, high = (float(v) for v in curve.encode(np.array(curve.light_range)))
     grey = low + (high - low) * (0.5 - 0.5 * np.cos(np.pi * np.linspace(0, 1, FIT_LEVELS)))
     light = np.log(np.maximum(curve.linearise(grey), SMALLEST_LIGHT))

@@ -1,15 +1,14 @@
-"""A first curve and the exposures that contradict the others, by one linear least-squares problem.
+"""First estimate of the curve, and exposures that contradict the others, by linear least squares.
 
 Debevec & Malik 1997, "Recovering high dynamic range radiance maps from photographs", doi:10.1145/258734.258884:
-``g(z) = ln light + ln exposure`` with g, the logarithm of the inverse curve, and the light of every pixel unknown.
-Here g is piecewise linear over some twenty greys, and every picture has a correction c of its log exposure too:
+``g(z) = ln light + ln exposure``, with g, the logarithm of the inverse curve, and the light of every pixel unknown.
+Here g is piecewise linear over KNOTS greys, and each picture also has a correction c of its log exposure:
 
     g(z_pn) = l_p + ln t_n + c_n
 
-Corrections that follow a + β ln t cannot be told from a curve raised to a power: (g, l, t) and their multiples fit
-alike.  So the problem is solved with such a trend forbidden, and the trend is then chosen so that most pictures need
-no correction: a line through the corrections that a few wrong exposures cannot bend (all lines through two pictures
-are tried).
+Corrections of the form a + β ln t are indistinguishable from an exponent of the curve: scaling (g, l, ln t) leaves the
+fit unchanged.  The problem is therefore solved with such a trend excluded; the trend is then chosen so that most
+pictures need no correction, by a robust line through the corrections (lines through pairs of pictures are tried).
 """
 
 from __future__ import annotations
@@ -25,36 +24,36 @@ from virest.inference.robust import robust_std
 Array = NDArray[np.float64]
 KNOTS = 18
 SMOOTHNESS = 0.03
-"""Weight of the curve's roughness against all of the data.
+"""Weight of the curve's roughness relative to all data.
 
-The noise of the greys draws g to stairs wherever the exposures leave it free, as with equal steps of exposure they
-leave every curve whose logarithm differs by a function with that period.  The draw grows with the number of samples, so
-the roughness must count in proportion to it.  Where exposures lie close, the data outweigh it by far.
+Noise pulls g towards a staircase wherever the exposures do not constrain it; equal exposure steps, for example, allow
+any function with the period of the steps to be added to g.  The pull grows with the number of samples, so the roughness
+weight is proportional to it.  For closely spaced exposures the data outweigh it by far.
 """
 PASSES = 4
 CONTRADICTS_EV = 0.1
 MIN_PICTURES = 4
-"""With fewer, any exposures are consistent with some curve."""
+"""With fewer pictures, any exposures are consistent with some curve."""
 ROBUST_Z = 4.0
 LN2 = float(np.log(2.0))
 
 
 @dataclass(frozen=True, slots=True)
 class FirstCurve:
-    """The inverse curve at some greys, and which exposures fit it."""
+    """Inverse curve at KNOTS greys, and the corrections of the exposures."""
 
     grey: Array
     """(k,) levels."""
     log_light: Array
-    """(k,) natural logarithm of the exposure at them, 0 at the brightest."""
+    """(k,) natural logarithm of the exposure at these greys, 0 at the brightest."""
     correction_ev: Array
-    """(pictures,) what must be added to log2 of each listed exposure."""
+    """(pictures,) correction to add to log2 of each listed exposure."""
     suspect: NDArray[np.bool_]
     """(pictures,) whether the listed exposure contradicts the others."""
 
 
 def fit_first_curve(samples: BracketSamples) -> FirstCurve:
-    """Solve for the curve and the corrections, and tell the corrections that stand out."""
+    """Solve for the curve and the corrections, and mark outlying corrections as suspect."""
     measured = samples.measured & (samples.measured.sum(axis=1, keepdims=True) >= 2)
     greys = samples.low + (samples.high - samples.low) * np.linspace(0, 1, KNOTS) ** 1.5
     basis = _hats(samples.grey, greys)
@@ -74,36 +73,36 @@ def fit_first_curve(samples: BracketSamples) -> FirstCurve:
 
 
 def _smooth_slopes(g: Array, greys: Array) -> Array:
-    """(k − 1,) slopes of g between the knots, evened out over neighbours.
+    """Slopes (k − 1,) of g between the knots, smoothed over five neighbours.
 
-    Weights go by the slope: were it taken as it stands, a flat piece would gain weight, grow flatter, and the curve
-    would turn into stairs that follow equal steps of exposure.
+    Weights depend on the slope.  Without smoothing, a flat piece gains weight and becomes flatter, and the curve
+    degenerates into a staircase that follows equal exposure steps.
     """
     slopes = np.log(np.maximum(np.diff(g) / np.diff(greys), 1e-4))
     return np.exp(np.convolve(np.pad(slopes, 2, "edge"), np.full(5, 0.2), "valid"))
 
 
 def _hats(values: Array, knots: Array) -> Array:
-    """Piecewise linear basis, values.shape + (k,)."""
-    place = np.clip(np.searchsorted(knots, values) - 1, 0, len(knots) - 2)
-    part = np.clip((values - knots[place]) / (knots[place + 1] - knots[place]), 0.0, 1.0)
+    """Piecewise linear (hat) basis at values: (*values.shape, k)."""
+    interval = np.clip(np.searchsorted(knots, values) - 1, 0, len(knots) - 2)
+    part = np.clip((values - knots[interval]) / (knots[interval + 1] - knots[interval]), 0.0, 1.0)
     out = np.zeros((*values.shape, len(knots)))
-    np.put_along_axis(out, place[..., None], (1.0 - part)[..., None], -1)
-    np.put_along_axis(out, place[..., None] + 1, part[..., None], -1)
+    np.put_along_axis(out, interval[..., None], (1.0 - part)[..., None], -1)
+    np.put_along_axis(out, interval[..., None] + 1, part[..., None], -1)
     return out
 
 
 def _solve(basis: Array, weight: Array, log_t: Array, greys: Array) -> tuple[Array, Array, Array]:
-    """(g, c, residual) with every pixel's light eliminated: its mean of g − ln t − c under the weights."""
+    """Solve for (g, c, residual) with each pixel's light eliminated as its weighted mean of g − ln t − c."""
     count = len(log_t)
     design = np.concatenate([basis, np.broadcast_to(-np.eye(count), (*basis.shape[:2], count))], axis=-1)
     share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
     design = design - np.einsum("pn,pnk->pk", share, design)[:, None, :]
     target = np.broadcast_to(log_t, weight.shape)
     target = target - (share * target).sum(axis=1, keepdims=True)
-    flat, wide = design.reshape(-1, design.shape[-1]), weight.ravel()
-    normal = flat.T @ (flat * wide[:, None])
-    right = flat.T @ (wide * target.ravel())
+    rows, weights = design.reshape(-1, design.shape[-1]), weight.ravel()
+    normal = rows.T @ (rows * weights[:, None])
+    right = rows.T @ (weights * target.ravel())
     strength = float(np.trace(normal)) / len(normal)
     for row, factor in _side_conditions(greys, log_t, weight.sum(axis=0)):
         normal += factor * strength * np.outer(row, row)
@@ -112,10 +111,10 @@ def _solve(basis: Array, weight: Array, log_t: Array, greys: Array) -> tuple[Arr
 
 
 def _side_conditions(greys: Array, log_t: Array, known: Array) -> list[tuple[Array, float]]:
-    """(row, strength): no sum and no trend of the corrections, g zero at the top, g smooth over ln grey.
+    """Side conditions (row, strength): zero sum and trend of the corrections, g zero at the top, g smooth over ln grey.
 
-    Sum and trend count each picture by what is ``known`` of it.  Were all counted alike, a picture with hardly a usable
-    grey could take on a huge correction for nothing, and with it the trend that makes g vanish.
+    Sum and trend weight each picture by its total data weight ``known``.  With equal weights a picture with hardly any
+    usable grey could take a huge correction at no cost, and with it the trend that makes g vanish.
     """
     count, knots = len(log_t), len(greys)
     share = known / known.sum()
@@ -143,9 +142,10 @@ def _untrended(greys: Array, g: Array, correction: Array, log_t: Array) -> First
 
 
 def robust_line(x: Array, y: Array) -> tuple[float, float]:
-    """(level, trend) of the line through two of the points that leaves the least sum of capped deviations.
+    """Robust line (level, trend): the line through two points with the least sum of capped deviations.
 
-    With fewer than MIN_PICTURES points: no trend, the median as level.
+    Pairs closer than a quarter of the range are skipped.  The line is refitted to its inliers by least squares.  With
+    fewer than MIN_PICTURES points the trend is 0 and the level the median.
     """
     if len(x) < MIN_PICTURES:
         return float(np.median(y)), 0.0
@@ -167,10 +167,13 @@ def robust_line(x: Array, y: Array) -> tuple[float, float]:
 
 
 def outlying(ev: Array) -> NDArray[np.bool_]:
-    """Which corrections are more than CONTRADICTS_EV and ROBUST_Z deviations (median absolute) from the others'."""
+    """Corrections more than CONTRADICTS_EV and ROBUST_Z robust standard deviations from the median.
+
+    None with fewer than MIN_PICTURES pictures, or if half of the pictures or more would be outliers.
+    """
     if len(ev) < MIN_PICTURES:
         return np.zeros(len(ev), bool)
-    away = np.abs(ev - np.median(ev))
-    spread = robust_std(away)
-    suspect = (away > CONTRADICTS_EV) & (away > ROBUST_Z * spread)
+    deviation = np.abs(ev - np.median(ev))
+    std_ev = robust_std(deviation)
+    suspect = (deviation > CONTRADICTS_EV) & (deviation > ROBUST_Z * std_ev)
     return suspect if suspect.sum() < 0.5 * len(ev) else np.zeros(len(ev), bool)

@@ -1,8 +1,8 @@
 """`virest calibrate`: clock, readout, axes, bias and lens of a phone from an ordinary capture, without a target.
 
-Coarse: turns of the pictures against the gyroscope's, at every offset within a second, for any axes.  Then one robust
-fit over tracked points, each at its own row's time, first on few points to find the axis and sense of the readout and
-what the camera's translation needs, then on many with everything that was asked for.
+The coarse stage compares frame rotations with the gyroscope at every offset within 1 s, for any axes.  A robust fit to
+tracked points follows, each at its own row's time: first on few points, for the readout's axis and sign and for the
+camera's translation; then on many points, with all requested parameters.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from virest.calibration.calibrated_values import (
     calibrated,
     correlations_of,
     direction_value,
-    held_back,
     is_determined,
+    reset_undetermined,
     roughly_known,
     value_of,
     variances_of,
@@ -55,42 +55,42 @@ Array = NDArray[np.float64]
 FEW_POINTS, MANY_POINTS = 2000, 7000
 START_INVERSE_DEPTH_PER_M = 0.5
 EXPLAINED_SCALE = 1.15
-"""Whitened differences of this size need no translation."""
+"""Whitened residuals with a scale below this need no translation."""
 TRANSLATION_GAIN = 0.97
-"""A translation stays if it brings the differences below this part."""
+"""A translation is kept if it reduces the residual scale below this fraction."""
 DIRECTION_COST = 12.0
-"""Readouts along rows and along columns are told apart from this difference in cost, in units of its own noise."""
+"""Minimum cost difference, in squared residual scales, between readouts along rows and along columns."""
 OUTLIER_WEIGHT = 0.1
-ASTRAY_PASSES = 3
+EXCLUSION_PASSES = 3
 MANY_OUTLIERS = 0.1
 CONSTANT_EXPOSURE_S = 1e-4
-"""Exposures that differ by no more tell no offset from a scale of theirs, nor from the stamp's meaning."""
+"""If exposures vary by less, an offset cannot be separated from their scale, nor from the timestamp reference."""
 DRIFT_SIGMA, LEAST_DRIFT_S = 4.5, 1e-3
-"""Clocks are said to drift apart above this many deviations (false alarms: 7e-6) and this much over the capture."""
+"""Clock skew is fitted if the drift exceeds this many σ (false-alarm probability 7e-6) and this much per capture."""
 FRAME_LAG = "frame-lag"
-"""The start-up's lag, which ``--with`` adds too."""
+"""Start-up lag; an additional key of ``--with``."""
 
 
 @dataclass(frozen=True, slots=True)
 class GeometryCalibration:
-    """A calibrated profile and what it is worth."""
+    """A calibrated profile and its quality."""
 
     profile: CameraProfile
     values: tuple[CalibratedValue, ...]
     correlations: tuple[tuple[str, str, float], ...]
-    """Pairs of values whose errors go together by more than 0.9."""
+    """Pairs of values with an error correlation above 0.9."""
     translation: str
-    """``none``, ``inertial`` (the accelerometer's path before a plane) or ``direction`` (points judged across it)."""
+    """``none``, ``inertial`` (accelerometer path before a plane) or ``direction`` (residuals across the parallax)."""
     residual_px: float
-    """Robust standard deviation per coordinate of tracked minus predicted points, relief along parallax allowed for."""
+    """Robust standard deviation per coordinate of tracked minus predicted points, without relief along the parallax."""
     noise_px: float
-    """Tracking noise of the same kind, measured without the camera model."""
+    """Tracking noise in the same measure, without the camera model."""
     before_px: float
-    """The residual of the starting profile, at the offset found coarsely."""
+    """Residual of the start profile at the coarse offset."""
     explained: float
-    """Part of the pictures' changing turns that the gyroscope explains."""
+    """Fraction of the changes in frame rotation that the gyroscope explains."""
     moving_fraction: float
-    """Part of the tracks that do not go with the camera's motion."""
+    """Fraction of the tracks that do not follow the camera's motion."""
     pairs: int
     tracks: int
     notes: tuple[str, ...]
@@ -98,12 +98,12 @@ class GeometryCalibration:
 
     @property
     def determined(self) -> bool:
-        """Whether everything asked for was found."""
+        """Whether all values were determined."""
         return all(value.determined for value in self.values)
 
     @property
     def verdict(self) -> str:
-        """One line for people."""
+        """One-line summary for the user."""
         open_values = [value.name for value in self.values if not value.determined]
         if not open_values:
             return "calibrated"
@@ -117,12 +117,13 @@ def calibrate_geometry(
     extra: Sequence[str] = (),
     progress: Callable[[str], None] | None = None,
 ) -> GeometryCalibration:
-    """Fit time offset, readout, IMU-camera rotation and gyroscope bias, and what ``extra`` (keys of OPTIONAL) adds.
+    """Fit time offset, readout, IMU–camera rotation, gyroscope bias and the terms in ``extra``.
 
-    Raises CalibrationError where the data do not determine even the offset: a camera at rest, a steady pan, too few
-    points, pictures that do not follow the gyroscope.
+    extra: keys of OPTIONAL, and FRAME_LAG.  progress: called with the name of each finished stage.  Raises
+    CalibrationError if the data do not determine even the offset: a camera at rest, a steady pan, too few points,
+    frames that do not follow the gyroscope.
     """
-    say = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     observed = observe_tracks(capture, pairs, profile)
     lag = None
     if FRAME_LAG in extra and len(observed.pairs) >= MIN_PAIRS:
@@ -134,43 +135,43 @@ def calibrate_geometry(
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
         raise CalibrationError(f"{len(observed.pairs)} pairs of frames lie inside the inertial data")
-    say("coarse")
+    report("coarse")
     wanted = [terms_of.TIME_OFFSET, terms_of.GYRO_BIAS, terms_of.IMU_ROTATION]
     names = list(dict.fromkeys([*extra, *(["focal"] if unknown_focal else [])]))
     asked = [OPTIONAL[name] for name in names if name in OPTIONAL]
     wanted += [term for term in asked if term is terms_of.FOCAL]
     rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, wanted, asked)
     rough = _with_uneven_rows(rough, start)
-    say("readout")
+    report("readout")
     wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS, *asked]
-    left_out = 0.0
-    for _ in range(ASTRAY_PASSES):
+    excluded = 0.0
+    for _ in range(EXCLUSION_PASSES):
         table = observed.table(MANY_POINTS)
         fit = fit_tracks(capture.imu, table, rough.profile, wanted, for_table(rough.scene, table))
-        observed, astray = observed.without_astray(table.first_px, fit.distance)
-        left_out += (1 - left_out) * astray
-        if not astray:
+        observed, newly_excluded = observed.without_astray(table.first_px, fit.distance)
+        excluded += (1 - excluded) * newly_excluded
+        if not newly_excluded:
             break
     corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
-    if corrected:  # where no accelerometer tells the travel, nothing tells its part of the blur
+    if corrected:  # without an accelerometer the blur due to translation is unknown
         table = replace(table, second_px=table.second_px - blur_bias_px(fit.ground, table))
         fit = fit_tracks(capture.imu, table, fit.profile, wanted, fit.scene)
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(capture.imu, table, fit, float(np.median(observed.noise_px)), vary)
     if _clocks_drift(held.get("clock-skew"), float(np.ptp(fit.seconds))):
         found = calibrate_geometry(capture, profile, pairs, (*extra, "clock-skew"))
-        say("joint")
+        report("joint")
         return replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
-    found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, left_out, corrected)
-    say("joint")
+    found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, excluded, corrected)
+    report("joint")
     found = replace(found, notes=(*found.notes, *held_notes(held, names), *_uneven_note(found.profile, profile)))
     return found if lag is None else _with_lag(found, lag)
 
 
 def _clocks_drift(skew: HeldValue | None, span_s: float) -> bool:
-    """Whether clocks drift apart beyond doubt, whose skew was held fixed; None: it was not.
+    """Whether a skew that was held fixed is significant and large; skew is None if it was fitted.
 
-    One offset for all of a capture is then right at one instant only, and looks well known.
+    A single offset is then right at one instant only, although it looks well determined.
     """
     if skew is None or skew.std[0] > calibrated("clock_skew").max_std:
         return False
@@ -178,7 +179,7 @@ def _clocks_drift(skew: HeldValue | None, span_s: float) -> bool:
 
 
 def _drift_note(found: GeometryCalibration, given_skew: float) -> str:
-    """What is said where the clock's skew was fitted unasked."""
+    """Note that the clock skew was fitted without being requested."""
     std = float(np.max([np.max(np.asarray(v.std, float)) for v in found.values if v.name == "clock_skew"]))
     span_ms, skew = 1e3 * float(np.ptp(found.fit.seconds)), found.profile.clock_skew - given_skew
     drift_ms, std_ms = span_ms * skew, span_ms * std
@@ -186,7 +187,7 @@ def _drift_note(found: GeometryCalibration, given_skew: float) -> str:
 
 
 def _at_true_times(capture: Capture, observed: ObservedTracks, lag: StartUpLag) -> ObservedTracks:
-    """The pairs with the stamps that a lag gives them; without one those of the start-up are left out."""
+    """Correct the pairs' timestamps by the start-up lag; if it is undetermined, exclude pairs of start-up frames."""
     if lag.determined:
         return replace(observed, stamp_s=observed.stamp_s + np.array(lag.by_frame_s))
     usable = np.array([frame.skip_reason is None for frame in capture.frames])
@@ -226,7 +227,7 @@ def _require_coarse(
 
 
 def _started(profile: CameraProfile, observed: ObservedTracks, coarse: CoarseAlignment) -> CameraProfile:
-    """The profile with the coarse offset and axes, and a guessed lens where it has none."""
+    """The profile with the coarse offset and axes, and a default lens if it has none."""
     return replace(
         profile,
         time_offset_s=coarse.time_offset_s,
@@ -244,16 +245,16 @@ class _Rough:
     scene: Motion | None
     direction_known: bool
     before: TrackFit
-    """With the starting profile's readout and nothing but what was asked for."""
+    """Fit of the time offset alone, with the start profile's readout."""
 
 
 def _readout_axis(
     imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term], asked: list[Term]
 ) -> _Rough:
-    """Fit a readout of either sense along the rows and along the columns, and keep the better axis.
+    """Fit a readout of either sign along rows and along columns, and keep the better axis.
 
-    asked: the terms of the joint fit beside the usual ones.  They are fitted here only where the points need no
-    translation with them: a wrong lens alone looks like travel.
+    asked: optional terms of the joint fit.  They are fitted here only if the points then need no translation, since a
+    wrong lens alone looks like translation.
     """
     along = "left_to_right" if start.shutter.reads_columns else "top_to_bottom"
     across = "top_to_bottom" if start.shutter.reads_columns else "left_to_right"
@@ -271,7 +272,7 @@ def _readout_axis(
 
 
 def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
-    """A global shutter that sees the picture when its middle row was read, ready for a readout of either sense."""
+    """A global shutter at the time of the middle row: the start of a fit for a readout of either sign."""
     shutter = profile.shutter
     middle = (profile.time_offset_s or 0.0) + 0.5 * shutter.readout_time_s
     bare = replace(shutter, readout_time_s=0.0, readout_direction=direction, uneven=None)
@@ -279,7 +280,7 @@ def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
 
 
 def _with_uneven_rows(rough: _Rough, given: CameraProfile) -> _Rough:
-    """Put back by how much the profile's rows are late, where the points see the rows run as the profile has them."""
+    """Restore the profile's uneven row delays if the points confirm its readout direction."""
     uneven, found = given.shutter.uneven, right_way_round(rough.profile)
     if uneven is None:
         return rough
@@ -291,7 +292,7 @@ def _with_uneven_rows(rough: _Rough, given: CameraProfile) -> _Rough:
 
 
 def _uneven_note(fitted: CameraProfile, given: CameraProfile) -> tuple[str, ...]:
-    """What is said where the profile's delay over the row could not be kept."""
+    """Note that the profile's uneven row delays could not be kept."""
     if given.shutter.uneven is None or fitted.shutter.uneven is not None:
         return ()
     return (
@@ -303,9 +304,9 @@ def _uneven_note(fitted: CameraProfile, given: CameraProfile) -> tuple[str, ...]
 def _fit_with_translation(
     imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term], asked: list[Term]
 ) -> TrackFit:
-    """The simplest translation that explains the points: none, the accelerometer's, or a direction of travel.
+    """Fit with the simplest translation that explains the points: none, the accelerometer's, or a direction.
 
-    None where the terms asked for explain them too.
+    No translation is fitted if the requested terms explain the points.
     """
     plain = fit_tracks(imu, table, start, wanted)
     if plain.scale < EXPLAINED_SCALE:
@@ -332,10 +333,14 @@ def _conclude(
     coarse: CoarseAlignment,
     rough: _Rough,
     fit: TrackFit,
-    astray: float,
+    excluded: float,
     corrected: bool,
 ) -> GeometryCalibration:
-    """corrected: blur's bias was taken out of the points, and that moved the values by the fit's change."""
+    """Assess and assemble the result.
+
+    excluded: fraction of points excluded as moving independently.  corrected: whether the blur bias was removed from
+    the points, so that the fit's change measures what may remain of it.
+    """
     noise = float(np.median(observed.noise_px))
     if corrected:
         gyro_rad_s = _gyro_mean_std_rad_s(imu, float(np.ptp(fit.seconds)))
@@ -347,7 +352,7 @@ def _conclude(
     determined = {
         term.name: term.name not in beyond and is_determined(fit, term.name, variances[term.name]) for term in fit.terms
     }
-    profile = right_way_round(held_back(fit, given, start, determined))
+    profile = right_way_round(reset_undetermined(fit, given, start, determined))
     if not rough.direction_known and not determined["readout_time"]:
         profile = keep_readout(profile, given)
     values = tuple(
@@ -363,9 +368,9 @@ def _conclude(
     values = (*values[:2], direction_value(given, profile, direction_known), *values[2:])
     profile = with_estimates(profile, values)
     moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
-    notes = _notes(coarse, fit, moving, astray, observed, determined)
-    notes = (*notes, *(f"{calibrated(name).name} would be {said}: that is implausible, so the given value was kept; "
-                       "virest diagnose may find the real cause" for name, said in beyond.items()))  # fmt: skip
+    notes = _notes(coarse, fit, moving, excluded, observed, determined)
+    notes = (*notes, *(f"{calibrated(name).name} would be {reason}: that is implausible, so the given value was kept; "
+                       "virest diagnose may find the real cause" for name, reason in beyond.items()))  # fmt: skip
     return GeometryCalibration(
         profile, values, correlations_of(fit, variances), _translation(fit), residual_px(fit),
         tracking_noise_px(observed, fit), residual_px(rough.before), coarse.explained, moving,
@@ -374,16 +379,16 @@ def _conclude(
 
 
 def _drift_rad(fit: TrackFit, imu: ImuSamples) -> tuple[float, float]:
-    """Turn that the accelerometer's noise over a window could be taken for, and the window's length in seconds."""
+    """Apparent rotation (rad) due to accelerometer noise over a time window, and the window's length in seconds."""
     if not isinstance(fit.scene, InertialMotion):
         return 0.0, 1.0
     span_s = float(np.ptp(fit.seconds)) / fit.scene.windows
-    nearness = float(np.median(np.linalg.norm(fit.scene.plane_per_m, axis=-1)))
-    return drift_std_m(imu, span_s) * nearness, max(span_s, 0.1)
+    inverse_depth_per_m = float(np.median(np.linalg.norm(fit.scene.plane_per_m, axis=-1)))
+    return drift_std_m(imu, span_s) * inverse_depth_per_m, max(span_s, 0.1)
 
 
 def _gyro_mean_std_rad_s(imu: ImuSamples, span_s: float) -> float:
-    """Standard deviation of the mean of the gyroscope's white noise over a time: no picture tells it from a bias."""
+    """Standard deviation of the gyroscope's mean white noise over a time, which is indistinguishable from a bias."""
     noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
     return (noise.gyro_density or 0.0) / max(span_s, 0.1) ** 0.5 if noise else 0.0
 
@@ -398,7 +403,7 @@ def _notes(
     coarse: CoarseAlignment,
     fit: TrackFit,
     moving: float,
-    astray: float,
+    excluded: float,
     observed: ObservedTracks,
     determined: dict[str, bool],
 ) -> tuple[str, ...]:
@@ -407,8 +412,8 @@ def _notes(
         notes.append("the profile's T_cam_imu does not fit: axes were estimated from the rotations")
     if isinstance(fit.scene, DirectedMotion):
         notes.append("the camera translates and there is no accelerometer: points were judged across their parallax")
-    if astray:
-        notes.append(f"{astray:.0%} of the points lie in image regions that move independently and were excluded")
+    if excluded:
+        notes.append(f"{excluded:.0%} of the points lie in image regions that move independently and were excluded")
     if moving > MANY_OUTLIERS:
         notes.append(f"{moving:.0%} of the tracks do not follow the camera (moving objects, or not a plane)")
     if not observed.exposure_known:

@@ -1,13 +1,13 @@
 """Black, white and noise of each channel of a bracket, measured from the pictures alone.
 
-A grey that more light does not change is an end of the curve: black where it is dark, white where it is bright.  The
-channels of a scanned film or of a picture with a colour cast end at different greys; those are brought to common ends
-first, since one curve stands for all three.
+A grey that does not change with more light is an end of the curve: black if dark, white if bright.  The channels of a
+scanned film or of a picture with a colour cast end at different greys.  They are equalised first, since one curve
+describes all three.
 
-Noise goes by grey and by channel, as a table and not as a law of sensors: a tone curve lifts the noise of the dark, an
-encoder smooths it away or rounds whole blocks alike.  Two witnesses, of which the larger counts: the spread within flat
-squares, which does not see what a square's pixels share; and how far the greys of one place at many exposures lie from
-any one curve, which does.
+Noise is tabulated by grey and channel instead of modelled as sensor noise: a tone curve amplifies it in the shadows,
+and an encoder smooths it away or rounds whole blocks alike.  Of two estimates the larger is used: the variance within
+flat squares, which misses errors common to a square's pixels; and the scatter of one site's greys at many exposures
+about a curve, which includes them.
 """
 
 from __future__ import annotations
@@ -24,25 +24,26 @@ from virest.inference.robust import MEDIAN_TO_STD
 
 Array = NDArray[np.float64]
 DARKEST_JUDGED, BRIGHTEST_JUDGED = 4.0, 251.0
-"""Greys between which the noise of a square is that of its light, mostly: beyond, it is cut off at 0 or 255."""
+"""Range of greys in which a square's noise is mostly unclipped; beyond it, noise is clipped at 0 or 255."""
 BINS = 13
-FEW_SQUARES = 15
+MIN_SQUARES = 15
 FLAT_SHARE = 0.1
+"""Quantile of the variance that represents the flattest squares."""
 ROUNDING_LEVELS = 0.15
-"""Neighbours share the rounding of their levels: no mean of a square is more precise."""
+"""Lower limit on the standard deviation of a square's mean, since neighbouring pixels share rounding errors."""
 SMALLEST_VARIANCE, LARGEST_VARIANCE = 0.05, 400.0
 MORE_LIGHT = 2**0.4
-"""Between two pictures, for a grey to show that it does not follow the light."""
+"""Minimum exposure ratio of two pictures to test whether a grey follows the light."""
 SAME_LEVELS = 0.75
 PILE = 0.02
-"""Share of a channel's samples that rest at an end, for it to be one."""
-APART_LEVELS = 1.5
-"""A conversion from YCbCr rounds three channels apart by up to this."""
+"""Minimum fraction of a channel's samples that must rest at a grey for it to be an end."""
+DIFFER_LEVELS = 1.5
+"""A conversion from YCbCr rounds the three channels to ends that differ by up to this."""
 CUT_SIGMA = 3.0
-FAIR_SIGMA = 2.0
-"""A fortieth of the greys that are fairly inside fall beyond the limit by their noise."""
-ALIKE = 31
-"""Places of about one brightness, whose median is good to a fifth of their scatter."""
+RELIABLE_SIGMA = 2.0
+"""About 2.5 % of the reliable greys are moved beyond the limit by their noise."""
+WINDOW_SITES = 31
+"""Sites of similar brightness in a running median, which is accurate to a fifth of their scatter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +51,9 @@ class GreyNoise:
     """Variance of a sample's grey, by channel and grey."""
 
     greys: Array
-    """(k,) levels, rising."""
+    """(k,) levels, increasing."""
     variance: Array
-    """(channels, k) levels squared; straight between the greys, held beyond them."""
+    """(channels, k) levels²; linear between the greys, constant beyond them."""
 
     def at(self, grey: Array, channel: NDArray[np.int64]) -> Array:
         """Variance of greys (samples, ...) of channels (samples,)."""
@@ -63,32 +64,32 @@ class GreyNoise:
         return found
 
     def at_least(self, other: Array) -> GreyNoise:
-        """The larger of this and of variances (channels, k) at the same greys; NaN: not known."""
+        """Maximum with variances (channels, k) at the same greys; NaN: unknown."""
         return replace(self, variance=np.fmax(self.variance, other))
 
 
 def grey_bins() -> tuple[Array, Array]:
-    """(edges, middles) of the greys at which noise is told, closer where it is dark."""
+    """(edges, centres) of the grey bins of the noise table, narrower in the shadows."""
     edges = DARKEST_JUDGED + (BRIGHTEST_JUDGED - DARKEST_JUDGED) * np.linspace(0, 1, BINS) ** 1.5
     return edges, 0.5 * (edges[1:] + edges[:-1])
 
 
 def pixel_noise(means: Array, variances: Array, pixels: int) -> GreyNoise:
-    """Variance of a pixel, from the flattest squares of each channel and grey.
+    """Noise variance of a pixel, from the flattest squares of each channel and grey.
 
-    means, variances: (channels, ...) of squares of ``pixels`` pixels.  Greys with too few squares take their
-    neighbours' noise, a channel with none the others'; so do greys whose noise is cut off at 0.
+    means, variances: (channels, ...) of squares of ``pixels`` pixels.  Greys with too few squares, or with noise
+    clipped at 0, are interpolated from their neighbours; a channel without any takes the mean of the others.
     """
     edges, middles = grey_bins()
-    # of squares that hold nothing but noise, this share has a smaller variance than chance x the true one
-    chance = float(chi2.ppf(FLAT_SHARE, pixels - 1)) / (pixels - 1)
+    # FLAT_SHARE of the squares with pure noise have a sample variance below this multiple of the true variance
+    quantile = float(chi2.ppf(FLAT_SHARE, pixels - 1)) / (pixels - 1)
     table = np.full((len(means), len(middles)), np.nan)
-    for c, (greys, spread) in enumerate(zip(means, variances, strict=True)):
-        place = np.digitize(greys, edges) - 1
+    for c, (greys, variance) in enumerate(zip(means, variances, strict=True)):
+        grey_bin = np.digitize(greys, edges) - 1
         for k in range(len(middles)):
-            inside = spread[place == k]
-            if len(inside) >= FEW_SQUARES:
-                table[c, k] = np.quantile(inside, FLAT_SHARE) / chance
+            inside = variance[grey_bin == k]
+            if len(inside) >= MIN_SQUARES:
+                table[c, k] = np.quantile(inside, FLAT_SHARE) / quantile
         table[c, middles < CUT_SIGMA * np.sqrt(np.nan_to_num(table[c]))] = np.nan
     if np.isnan(table).all():
         table[:] = 1.0
@@ -100,48 +101,48 @@ def pixel_noise(means: Array, variances: Array, pixels: int) -> GreyNoise:
     return GreyNoise(middles, np.clip(filled, SMALLEST_VARIANCE, LARGEST_VARIANCE))
 
 
-def of_means(noise: GreyNoise, pixels: int) -> GreyNoise:
-    """Variance of a square's mean, from that of its pixels."""
+def mean_noise(noise: GreyNoise, pixels: int) -> GreyNoise:
+    """Noise variance of a square's mean, from that of its pixels."""
     return replace(noise, variance=noise.variance / pixels + ROUNDING_LEVELS**2)
 
 
 def scatter_by_grey(residual: Array, grey: Array, channel: NDArray[np.int64], used: NDArray[np.bool_]) -> Array:
-    """(channels, bins) variance of residuals by grey, robustly; NaN where there are few.
+    """Robust variance (channels, bins) of residuals by grey; NaN for bins with too few.
 
-    residual, grey, used: (samples, pictures) levels.  Each sample's light was fitted to its n greys, which takes one
-    part in n of the variance away.
+    residual, grey, used: (samples, pictures) levels.  Each sample's light was fitted to its n greys, which reduces the
+    variance by a factor (n − 1) / n; this is corrected for.
     """
     edges, middles = grey_bins()
-    seen = used.sum(axis=1, keepdims=True)
-    free = np.sqrt(seen / np.maximum(seen - 1, 1))
-    place = np.clip(np.digitize(grey, edges) - 1, 0, len(middles) - 1)
+    count = used.sum(axis=1, keepdims=True)
+    correction = np.sqrt(count / np.maximum(count - 1, 1))
+    grey_bin = np.clip(np.digitize(grey, edges) - 1, 0, len(middles) - 1)
     found = np.full((int(channel.max()) + 1, len(middles)), np.nan)
     for c in range(len(found)):
-        of_channel = used & (channel == c)[:, None] & (seen > 1)
+        of_channel = used & (channel == c)[:, None] & (count > 1)
         for k in range(len(middles)):
-            inside = of_channel & (place == k)
-            if inside.sum() >= FEW_SQUARES:
-                found[c, k] = (MEDIAN_TO_STD * np.median(np.abs((residual * free)[inside]))) ** 2
+            inside = of_channel & (grey_bin == k)
+            if inside.sum() >= MIN_SQUARES:
+                found[c, k] = (MEDIAN_TO_STD * np.median(np.abs((residual * correction)[inside]))) ** 2
     return found
 
 
-def fairly_inside(grey: Array, light: Array, limits: tuple[Array, Array], sigma: Array) -> NDArray[np.bool_]:
-    """Where a grey lies between its limits by its light, and not by its noise, (samples, pictures).
+def reliably_inside(grey: Array, light: Array, limits: tuple[Array, Array], sigma: Array) -> NDArray[np.bool_]:
+    """Greys (samples, pictures) that lie between their limits because of their light and not of their noise.
 
-    grey, sigma: (samples, pictures) levels and their deviation; light: (samples, pictures) how bright each place is by
-    the other pictures, in any rising measure; limits: (samples, 1) each.  A picture so dark that only noise lifts some
-    places above the lower limit would else seem brighter than it is.  What a light gives is the median grey of the
-    places that are about as bright: that needs no curve.
+    grey, sigma: (samples, pictures) levels and their standard deviation.  light: (samples, pictures) brightness of each
+    sample according to the other pictures, on any increasing scale.  limits: (samples, 1) each.  Without this test, a
+    picture so dark that only noise lifts some samples above the lower limit would seem brighter than it is.  The
+    expected grey is the median of samples of similar brightness, which needs no curve.
     """
     low, high = limits
-    fair = np.zeros(grey.shape, bool)
+    reliable = np.zeros(grey.shape, bool)
     for n in range(grey.shape[1]):
         order = np.argsort(light[:, n], kind="stable")
-        usual = np.empty(len(grey))
-        usual[order] = median_filter(grey[order, n], size=min(ALIKE, len(grey)), mode="nearest")
-        margin = FAIR_SIGMA * sigma[:, n]
-        fair[:, n] = (usual - margin > low[:, 0]) & (usual + margin < high[:, 0])
-    return fair
+        expected = np.empty(len(grey))
+        expected[order] = median_filter(grey[order, n], size=min(WINDOW_SITES, len(grey)), mode="nearest")
+        margin = RELIABLE_SIGMA * sigma[:, n]
+        reliable[:, n] = (expected - margin > low[:, 0]) & (expected + margin < high[:, 0])
+    return reliable
 
 
 # ── ends of each channel ─────────────────────────────────────────────────────────────────────────────────────────
@@ -149,25 +150,26 @@ def fairly_inside(grey: Array, light: Array, limits: tuple[Array, Array], sigma:
 
 @dataclass(frozen=True, slots=True)
 class ChannelEnds:
-    """Black and white of each channel, and the common ones that they are brought to."""
+    """Black and white of each channel, and the common levels to which channels are equalised."""
 
     black: Array
     """(channels,) grey levels."""
     white: Array
+    """(channels,) grey levels."""
 
     @property
     def common(self) -> tuple[float, float]:
-        """Black and white of the picture as a whole."""
+        """Mean black and white over the channels."""
         return float(self.black.mean()), float(self.white.mean())
 
     @property
-    def apart(self) -> bool:
-        """Whether the channels end at greys that rounding cannot make different."""
-        return bool(max(np.ptp(self.black), np.ptp(self.white)) > APART_LEVELS)
+    def differ(self) -> bool:
+        """Whether the channels' ends differ by more than rounding can explain."""
+        return bool(max(np.ptp(self.black), np.ptp(self.white)) > DIFFER_LEVELS)
 
     @property
-    def spread_levels(self) -> float:
-        """Rms over channels and greys of how far a channel's curve lies from the common one."""
+    def rms_difference_levels(self) -> float:
+        """RMS difference over channels and greys between a channel's curve and the common one."""
         low, high = self.common
         at = np.linspace(0.0, 1.0, 65)
         off = (self.black - low)[:, None] * (1.0 - at) + (self.white - high)[:, None] * at
@@ -175,45 +177,45 @@ class ChannelEnds:
 
     @property
     def gain(self) -> Array:
-        """(channels,) by which a difference of greys grows where the ends become the common ones."""
+        """(channels,) factor on grey differences when the channels are equalised."""
         low, high = self.common
         return np.asarray((high - low) / (self.white - self.black))
 
-    def levelled(self, means: Array) -> Array:
-        """Greys (channels, ...) with the common ends; clipped ones, at 0 and 255, stay."""
+    def equalised(self, means: Array) -> Array:
+        """Map greys (channels, ...) to the common ends; clipped greys, at 0 and 255, are unchanged."""
         shape = (-1,) + (1,) * (means.ndim - 1)
         moved = self.common[0] + (means - self.black.reshape(shape)) * self.gain.reshape(shape)
         clipped = (means <= 0) | (means >= 255)
         return np.where(clipped, means, np.clip(moved, 0.5, 254.5))
 
     def describe(self) -> str:
-        """For people."""
+        """Note for the user."""
         ends = (" ".join(f"{v:.1f}" for v in side) for side in (self.black, self.white))
         black, white = ends
         return (
             f"the channels end at different greys (black at {black}, white at {white} for R G B); the curve is that of "
-            f"their mean, from which a channel lies {self.spread_levels:.1f} levels rms"
+            f"their mean, from which a channel lies {self.rms_difference_levels:.1f} levels rms"
         )
 
 
 def channel_ends(means: Array, exposure: Array) -> ChannelEnds:
-    """Where each channel's greys rest although the light changes; 0 and 255 where none do.
+    """Greys at which each channel does not follow the light; 0 and 255 if there are none.
 
-    means: (channels, pictures, places) levels; exposure: (pictures,) listed.
+    means: (channels, pictures, sites) levels.  exposure: (pictures,) listed.
     """
     order = np.argsort(exposure, kind="stable")
     ratio = exposure[order[1:]] / exposure[order[:-1]]
     pairs = [(order[k], order[k + 1]) for k in range(len(ratio)) if ratio[k] >= MORE_LIGHT]
     ends = [_resting_greys(channel, pairs) for channel in means]
     black, white = (np.array(side, float) for side in zip(*ends, strict=True))
-    # an end that only some channels show may be the others' too
+    # an end that only some channels show may also be that of the others: use the default for all
     black = black if np.isfinite(black).all() else np.zeros(len(means))
     white = white if np.isfinite(white).all() else np.full(len(means), 255.0)
     return ChannelEnds(black, white)
 
 
 def _resting_greys(channel: Array, pairs: list[tuple[Any, Any]]) -> tuple[float, float]:
-    """(dark, bright) grey at which places of a channel (pictures, places) rest; NaN: none does."""
+    """(dark, bright) grey at which sites of a channel (pictures, sites) rest while the light changes; NaN if none."""
     if not pairs:
         return np.nan, np.nan
     darker, brighter = channel[[p[0] for p in pairs]], channel[[p[1] for p in pairs]]
@@ -224,6 +226,6 @@ def _resting_greys(channel: Array, pairs: list[tuple[Any, Any]]) -> tuple[float,
             found.append(np.nan)
             continue
         counts = np.bincount(np.rint(part).astype(np.int64), minlength=256)
-        place = int(np.argmax(np.convolve(counts, np.ones(3), "same")))
-        found.append(float(part[np.abs(part - place) <= 1.5].mean()))
+        peak = int(np.argmax(np.convolve(counts, np.ones(3), "same")))
+        found.append(float(part[np.abs(part - peak) <= 1.5].mean()))
     return found[0], found[1]

@@ -1,6 +1,6 @@
-"""What a camera can be: limits of fitted values that follow from how sensors and lenses work.
+"""Physical limits of fitted camera values, from how sensors and lenses work.
 
-A fit that ends at such a limit, or beyond it, describes no camera; it compensates for something else.
+A value at or beyond its limit describes no real camera: the fit is compensating for something else.
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ from virest.effects.table import CLOCK_SKEW_OFF, GYRO_SCALE_OFF
 LEAST_READOUT_S = 1e-3
 """The fastest rolling shutters (stacked sensors, 960 frames/s) read a frame in about 1 ms; a global shutter has 0."""
 FOCAL_OF_LONG_SIDE = (0.3, 10.0)
-"""From an ultra-wide lens of 11 mm to a telephoto of 360 mm, in terms of a 36 mm wide sensor."""
+"""From an 11 mm ultra-wide to a 360 mm telephoto lens (35 mm equivalent), as a multiple of the image's long side."""
 DEPTH_M = (0.02, 1e4)
-"""From the closest focus of a macro lens to where parallax within an exposure is below any measurement."""
+"""From the closest focus of a macro lens to where parallax within an exposure is unmeasurable."""
 LEAST_EXPOSURE_S = 1e-6
 """No phone's or action camera's electronic shutter is faster than a few microseconds."""
 SCALE_OF_EXPOSURE = (0.05, 20.0)
-"""The true exposure over the logged one."""
+"""True exposure time / logged exposure time."""
 OFFSET_S = 2.0
-"""A larger offset is another recording, or another clock."""
+"""A larger offset means another recording or another clock."""
 
 
 def impossible(profile: CameraProfile, period_s: float, exposure_s: float) -> frozenset[str]:
     """Names of the effects whose values in a profile lie at or beyond their physical limits.
 
-    period_s: between frames; exposure_s: typical, as logged; 0: unknown.  A readout or an exposure takes at most the
-    period.  A readout below LEAST_READOUT_S, but for one of exactly 0, belongs to no sensor; a fitted one ends there.
+    period_s: between frames.  exposure_s: typical logged value; 0: unknown.  Readout and exposure must be shorter than
+    the period.  A readout below LEAST_READOUT_S, including 0, is no rolling shutter's.
     """
     found = set()
     shutter, lens = profile.shutter, profile.intrinsics
@@ -50,10 +50,10 @@ def impossible(profile: CameraProfile, period_s: float, exposure_s: float) -> fr
 
 
 def limit_reasons(profile: CameraProfile, period_s: float, exposure_s: float) -> dict[str, str]:
-    """Why values of a fitted profile are no findings, by the name of their effect: what they are, and what can be."""
+    """Why values of a fitted profile are implausible, by effect: the value and its physical range."""
     shutter, lens = profile.shutter, profile.intrinsics
     least_px, most_px = (part * max(profile.width, profile.height) for part in FOCAL_OF_LONG_SIDE)
-    said = {
+    reasons = {
         "readout_time": (
             f"{1e3 * shutter.readout_time_s:.2f} ms, where rolling shutters take {1e3 * LEAST_READOUT_S:g} to "
             f"{1e3 * period_s:.1f} ms"
@@ -68,7 +68,7 @@ def limit_reasons(profile: CameraProfile, period_s: float, exposure_s: float) ->
         ),
         "time_offset": f"{profile.time_offset_s or 0.0:+.2f} s, where one recording has less than {OFFSET_S:g} s",
     }
-    found = {name: said[name] for name in impossible(profile, period_s, exposure_s)}
+    found = {name: reasons[name] for name in impossible(profile, period_s, exposure_s)}
     worst = max(profile.gyro_scale, key=lambda scale: abs(scale - 1))
     if abs(worst - 1) >= GYRO_SCALE_OFF:
         found["gyro_scale"] = f"{worst:.3f}, where gyroscopes are right to within {GYRO_SCALE_OFF:.0%}"
@@ -78,5 +78,5 @@ def limit_reasons(profile: CameraProfile, period_s: float, exposure_s: float) ->
 
 
 def is_depth(depth_m: float) -> bool:
-    """Whether a fitted depth lies inside its limits."""
+    """Whether a fitted depth is within its limits."""
     return DEPTH_M[0] < depth_m < DEPTH_M[1]

@@ -1,14 +1,14 @@
-"""Fit the exposure characteristic curve to a bracket, and say what is wrong with the fit (forward_model, section 4).
+"""Fit the response curve to an exposure bracket and assess the fit (forward_model, section 4).
 
-Model: the grey of place p in picture n is ``E(L_p · t_n · 2^c_n)`` plus noise, with the curve E, the light L_p of every
-place and a correction c_n of each listed exposure unknown, as in Debevec & Malik 1997, doi:10.1145/258734.258884, but
-with E of a named kind and residuals in grey levels, where the noise is.  By variable projection only the curve's few
-parameters and the c_n are searched; for each trial the light follows place by place.  Residuals are weighted by the
-noise and held down where they are large; clipped greys are censored: they only say "at least" or "at most".
+Model: the grey of sample p in picture n is ``E(L_p · t_n · 2^c_n)`` plus noise.  Unknown are the curve E, the light L_p
+of every sample and a correction c_n of each listed exposure, as in Debevec & Malik 1997, doi:10.1145/258734.258884, but
+with E of a named kind and residuals in grey levels, where the noise arises.  Variable projection leaves only the curve
+parameters and the c_n to be searched; the light follows sample by sample.  Residuals are weighted by the noise under a
+robust loss.  Clipped greys are censored: they bound the light from one side only.
 
-The c_n are sparse, not a trend (see ``exposure_check``): a picture's listed exposure is believed to within 0.02 EV,
-unless it contradicts the others, in which case it is free.  One curve is fitted to the three channels together, as the
-camera profile has one; a place's channels are separate places to the fit, but one to the tests.
+The c_n are sparse and have no trend (see ``exposure_check``): a listed exposure is trusted to 0.02 EV unless it
+contradicts the others, in which case it is free.  One curve is fitted to all three channels, since the camera profile
+has one.  The channels of a site are separate samples in the fit but one site in the tests.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from virest.calibration.curve_families import LogLookup, log_lookup
 from virest.calibration.curve_trials import (
     STRUCTURE_LEVELS,
     Trial,
-    _beaten,
     choose_kind,
+    fit_kinds,
     posterior_of,
     project,
-    refined,
+    refit,
     require_possible,
     residual_of,
     rms_levels,
-    try_kinds,
+    significantly_worse,
 )
 from virest.calibration.exposure_check import CONTRADICTS_EV, LN2, MIN_PICTURES, FirstCurve, fit_first_curve
-from virest.calibration.grey_levels import fairly_inside, scatter_by_grey
+from virest.calibration.grey_levels import reliably_inside, scatter_by_grey
 from virest.camera.response import KINDS, ResponseCurve
 from virest.errors import CalibrationError, SettingsError
 
@@ -46,41 +46,41 @@ MIN_RATIO = 2**0.25
 FEW_RATIO = 2**1.5
 MOVED_LEVELS = 8.0
 MAX_MOVED = 0.2
-USUAL_MISSES = 3.0
-"""A place whose worst miss exceeds the usual worst miss by this factor is left out."""
+WORST_OF_MEDIAN = 3.0
+"""A sample is excluded if its largest residual exceeds this multiple of the median over samples."""
 ESTABLISHED_Z = 3.0
 SCATTER_EV = 0.06
-"""Three times what a listed exposure is believed to deviate by."""
+"""Scatter of the listed exposures that is reported: three times their prior standard deviation."""
 OPEN_LEVELS = 2.0
-"""A curve that the data hold no better is said to be held loosely."""
+"""Standard deviation of the curve above which it is reported as loosely determined."""
 UNDETERMINED_LEVELS = 25.0
-"""A tenth of the greys: no measurement of a curve."""
+"""Standard deviation above which the fit is refused: a tenth of the grey range."""
 
 
 @dataclass(frozen=True, slots=True)
 class PictureFit:
-    """What the fit says of one picture."""
+    """Result of the fit for one picture."""
 
     file: str
     exposure: float
-    """As listed."""
+    """Listed exposure."""
     exposure_error_ev: float | None
-    """log2(listed / true): +1 where the listed exposure is twice the true one; None: the picture was left out."""
+    """log2(listed / true): +1 if the listed exposure is twice the true one; None: the picture was excluded."""
     contradicts: bool
-    """Whether the listed exposure contradicts the others'; its error then is measured, not held near 0."""
+    """Whether the listed exposure contradicts the others; its error is then free instead of held near 0."""
 
     @property
     def likely_exposure(self) -> float:
-        """What the exposure was, in the unit of the list."""
+        """Estimated true exposure, in the unit of the list."""
         return float(self.exposure / 2.0 ** (self.exposure_error_ev or 0.0))
 
 
 @dataclass(frozen=True, slots=True)
 class DataCloud:
-    """The samples as a plot shows them: each measured grey with the light that the fit gives it."""
+    """Samples for plotting: each measured grey with its fitted exposure."""
 
     light: Array
-    """(m,)"""
+    """(m,) exposure (light × time) on the curve's axis."""
     grey: Array
     """(m,) levels."""
     residual: Array
@@ -91,30 +91,31 @@ class DataCloud:
 
 @dataclass(frozen=True, slots=True)
 class CurveFit:
-    """A response curve and how far to trust it."""
+    """A response curve and its uncertainty."""
 
     curve: ResponseCurve
     rms_grey_levels: float
-    """Of the samples' residuals (means over small squares), outliers left out."""
+    """RMS residual of the samples (means over small squares), without outliers."""
     curve_std_grey_levels: float
-    """Standard deviation of the curve over the exposures covered, rms: what the data leave open among smooth curves of
-    any kind (``curve_certainty``), and what this kind is seen not to follow."""
+    """RMS standard deviation of the curve over the exposures covered: the posterior uncertainty among smooth curves of
+    any kind (``curve_certainty``), the misfit of this kind, and the differences between the channels."""
     covered_exposure: tuple[float, float]
-    """Exposures on the curve's axis between which there are data."""
+    """Range of exposures covered by data, on the curve's axis."""
     pictures: tuple[PictureFit, ...]
     notes: tuple[str, ...]
     held_out: dict[str, float]
-    """Held-out rms in grey levels of every kind that was tried."""
+    """Held-out RMS in grey levels of each kind tried."""
     cloud: DataCloud
 
 
 def fit_response(
     pictures: Sequence[BracketPicture], kind: str = "auto", rng: np.random.Generator | None = None
 ) -> CurveFit:
-    """Fit a curve of one kind, or of the simplest kind that held-out places do not reject (``auto``).
+    """Fit a curve of one kind, or of the simplest kind that held-out sites do not reject (``auto``).
 
-    Raises CalibrationError for fewer than two pictures, one exposure, no overlap, pictures clipped throughout,
-    misalignment that is too large or not rigid, and a scene that is not still.
+    Raises CalibrationError for fewer than two pictures, a single exposure, no overlap, pictures clipped throughout,
+    misalignment that is too large or not rigid, a scene that is not still, exposures that are not those of the
+    pictures, and a curve that the pictures do not determine.
     """
     if kind not in ("auto", *KINDS):
         raise SettingsError(f"kind '{kind}' is no curve", hint=f"use auto, {', '.join(KINDS)}")
@@ -128,11 +129,11 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     notes = [f"{p.file} was shifted by {np.hypot(*s):.1f} px and aligned" for p, s in
              zip(pictures, samples.shifts_px - np.median(samples.shifts_px, axis=0), strict=True)
              if np.hypot(*s) > 0.5]  # fmt: skip
-    notes += [samples.ends.describe()] * samples.ends.apart
+    notes += [samples.ends.describe()] * samples.ends.differ
     seen, samples = _keep_connected(pictures, np.ones(len(pictures), bool), samples)
     first = fit_first_curve(samples)
     require_possible(first, samples)
-    samples = _fairly_seen(_with_scatter(samples, first), first)
+    samples = _with_reliability(_with_scatter(samples, first), first)
     seen, samples = _keep_connected(pictures, seen, samples)
     notes += [
         f"{p.file} is clipped or too dark throughout and was left out"
@@ -142,55 +143,55 @@ def _fit_samples(pictures: Sequence[BracketPicture], samples: BracketSamples, ki
     first = fit_first_curve(samples)
     still = _still_rows(samples, first)
     samples = samples.take(still)
-    verdict = _fit_kinds(kind, samples, first, np.ones(len(first.suspect), bool))
-    # a picture that only the chosen kind finds wrong may as well show where the kind is
+    verdict = _choose_curve(kind, samples, first, np.ones(len(first.suspect), bool))
+    # an exposure that only the chosen kind finds wrong may show an error of the kind instead
     wrong_for_any = np.abs(first.correction_ev) > 0.5 * CONTRADICTS_EV
     doubtful = verdict.final.suspect & ~(verdict.established & wrong_for_any)
     if doubtful.any():
         first = replace(first, suspect=first.suspect & ~doubtful)
-        verdict = _fit_kinds(kind, samples, first, ~doubtful)
+        verdict = _choose_curve(kind, samples, first, ~doubtful)
     _require_determined(verdict)
     return _result(pictures, seen, verdict, samples, [*notes, *_criticise(verdict, samples)])
 
 
 @dataclass(frozen=True, slots=True)
 class _Verdict:
-    """The kinds that were fitted, and the one that was chosen."""
+    """All fitted kinds, and the chosen one."""
 
     trials: dict[str, Trial]
     chosen: str
     final: Trial
     """The chosen kind, fitted to all samples."""
     posterior: CurvePosterior
-    """Of the table: what the data alone leave open."""
+    """Posterior of the table: the uncertainty from the data alone."""
     structure_levels: float
-    """What residuals at one grey share."""
+    """RMS of the systematic residual by grey level."""
     misfit_levels: float
-    """The same; where a kind was asked for, at least its distance from the table."""
+    """The same; for a requested kind at least its distance from the table."""
     scatter_ev: float
-    """Of the believed exposures about the table."""
+    """Scatter of the trusted exposures about the table."""
 
     @property
     def std_levels(self) -> float:
-        """The curve's deviation: what the data leave open, and what the kind is seen not to follow."""
+        """Standard deviation of the curve: posterior uncertainty and misfit of the kind."""
         return float(np.hypot(self.posterior.rms_levels, self.misfit_levels))
 
     @property
     def established(self) -> NDArray[np.bool_]:
-        """(pictures,): whether a wrong exposure is told from another curve, by what a table leaves open."""
+        """(pictures,): whether an exposure error is significant given the posterior uncertainty of the table."""
         return np.abs(self.final.correction_ev) > ESTABLISHED_Z * self.posterior.exposure_std_ev
 
 
-def _fit_kinds(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wrong: NDArray[np.bool_]) -> _Verdict:
-    """Fit the kinds, choose one, and judge how far the data hold it."""
+def _choose_curve(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wrong: NDArray[np.bool_]) -> _Verdict:
+    """Fit the kinds on even sites, choose one on odd sites, refit it to all, and assess its uncertainty."""
     odd = samples.site % 2 == 1
-    trials = try_kinds(kind, samples.take(~odd), samples.take(odd), first)
+    trials = fit_kinds(kind, samples.take(~odd), samples.take(odd), first)
     chosen = kind if kind != "auto" else choose_kind(trials)
-    final = refined(trials[chosen], samples, may_be_wrong)
+    final = refit(trials[chosen], samples, may_be_wrong)
     table = replace(trials["table"], suspect=final.suspect)
-    left = residual_of(log_lookup(final.curve), samples, final.correction_ev)
-    use = samples.measured & (np.abs(left) < 6.0 * max(rms_levels(left[samples.measured]), 0.3))
-    misfit = structure = residual_structure(samples.grey[use], left[use])
+    residual = residual_of(log_lookup(final.curve), samples, final.correction_ev)
+    use = samples.measured & (np.abs(residual) < 6.0 * max(rms_levels(residual[samples.measured]), 0.3))
+    misfit = structure = residual_structure(samples.grey[use], residual[use])
     if kind not in ("auto", "table"):
         misfit = max(misfit, curve_distance_levels(table.curve, final.curve, (table.curve.x[1], 1.0)))
     scatter_ev = _scatter_ev(table)
@@ -198,9 +199,9 @@ def _fit_kinds(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wro
 
 
 def _scatter_ev(trial: Trial) -> float:
-    """Standard deviation of the believed corrections; two numbers are taken off them, level and trend."""
-    believed = trial.correction_ev[~trial.suspect]
-    return float(np.sqrt((believed**2).sum() / max(len(believed) - 2, 1)))
+    """Standard deviation of the trusted corrections, with two degrees of freedom less for level and trend."""
+    trusted = trial.correction_ev[~trial.suspect]
+    return float(np.sqrt((trusted**2).sum() / max(len(trusted) - 2, 1)))
 
 
 # ── refusals ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -219,7 +220,7 @@ def _require_bracket(pictures: Sequence[BracketPicture]) -> None:
 def _keep_connected(
     pictures: Sequence[BracketPicture], kept: NDArray[np.bool_], samples: BracketSamples
 ) -> tuple[NDArray[np.bool_], BracketSamples]:
-    """Which of all pictures are kept, of those kept already, and their samples."""
+    """Drop pictures that are clipped throughout: mask over all pictures, and the samples of those kept."""
     seen = _connected([p for p, k in zip(pictures, kept, strict=True) if k], samples)
     kept = kept.copy()
     kept[kept] = seen
@@ -228,7 +229,7 @@ def _keep_connected(
 
 
 def _connected(pictures: Sequence[BracketPicture], samples: BracketSamples) -> NDArray[np.bool_]:
-    """Which pictures are not clipped throughout. Raises CalibrationError where the rest fall into unrelated parts."""
+    """Mask of pictures not clipped throughout.  Raises CalibrationError if these do not overlap in one chain."""
     measured = samples.measured.astype(np.int64)
     shared = measured.T @ measured
     seen = np.diag(shared) >= MIN_SHARED
@@ -250,9 +251,9 @@ def _connected(pictures: Sequence[BracketPicture], samples: BracketSamples) -> N
 
 
 def _require_determined(verdict: _Verdict) -> None:
-    """Raises CalibrationError where a kind with free parameters is chosen among curves that the data do not tell apart.
+    """Raise CalibrationError for a kind with free parameters if the data do not determine the curve.
 
-    A kind without any is another matter: it says before all measurement what every picture must show.
+    A kind without parameters is allowed, since it is fixed before any measurement.
     """
     open_levels = verdict.posterior.rms_levels
     if len(verdict.final.parameters) and open_levels > UNDETERMINED_LEVELS:
@@ -261,63 +262,65 @@ def _require_determined(verdict: _Verdict) -> None:
 
 
 def _still_rows(samples: BracketSamples, first: FirstCurve) -> NDArray[np.bool_]:
-    """Samples that one light explains at every exposure. Raises CalibrationError where too many do not.
+    """Mask of samples explained by one light at every exposure.  Raises CalibrationError if too many are not.
 
-    A scene that moves is wrong at most exposures; what a movie's codec gets wrong at one exposure, it does at all
-    places: so the refusal goes by the rms over the exposures, and single misses are judged by what is usual.
+    A moving scene is wrong at most exposures; a codec error at one exposure affects all sites.  So a scene is refused
+    by the RMS over exposures, and single residuals are compared with the median over samples.
     """
-    miss = np.where(samples.measured, np.abs(_first_residual(samples, first)), 0.0)
+    residual = np.where(samples.measured, np.abs(_first_residual(samples, first)), 0.0)
     limit = max(MOVED_LEVELS, 8.0 * float(samples.sigma.max()))
-    rms = np.sqrt((miss**2).sum(axis=1) / np.maximum(samples.measured.sum(axis=1), 1))
+    rms = np.sqrt((residual**2).sum(axis=1) / np.maximum(samples.measured.sum(axis=1), 1))
     moved = rms > limit
     if moved.mean() > MAX_MOVED:
-        text = f"the scene is not still, or the exposures are wrong throughout: {moved.mean():.0%} of the places change"
+        text = (
+            f"the scene is not still, or the exposures are wrong throughout: {moved.mean():.0%} of the samples deviate"
+        )
         raise CalibrationError(
-            f"{text} by more than {MOVED_LEVELS:g} grey levels against any curve",
+            f"{text} by more than {MOVED_LEVELS:g} grey levels from any curve",
             hint="take a still scene in steady light from a tripod",
         )
-    worst = miss.max(axis=1)
-    return worst <= max(limit, USUAL_MISSES * float(np.median(worst)))
+    worst = residual.max(axis=1)
+    return worst <= max(limit, WORST_OF_MEDIAN * float(np.median(worst)))
 
 
 def _first_residual(samples: BracketSamples, first: FirstCurve) -> Array:
-    """Grey levels by which measurement and first curve differ, (samples, pictures)."""
+    """Measured grey levels minus those of the first curve, (samples, pictures)."""
     lookup = LogLookup(first.log_light, first.grey, np.gradient(first.grey, first.log_light))
     log_t = np.log(samples.exposure) + LN2 * first.correction_ev
     return samples.grey - lookup.level(project(lookup, samples, log_t)[:, None] + log_t)
 
 
 def _with_scatter(samples: BracketSamples, first: FirstCurve) -> BracketSamples:
-    """The samples with the noise that their scatter about a first curve shows, where that is more than squares do."""
+    """Raise the samples' noise to their scatter about the first curve where that is larger."""
     scatter = scatter_by_grey(_first_residual(samples, first), samples.grey, samples.channel, samples.measured)
     missing = np.full((len(samples.noise.variance) - len(scatter), scatter.shape[1]), np.nan)
     return replace(samples, noise=samples.noise.at_least(np.concatenate([scatter, missing])))
 
 
-def _fairly_seen(samples: BracketSamples, first: FirstCurve) -> BracketSamples:
-    """The samples with those greys told that only noise puts between the limits, or beyond them."""
+def _with_reliability(samples: BracketSamples, first: FirstCurve) -> BracketSamples:
+    """Mark the greys whose position between the censoring limits is not decided by noise."""
     lookup = LogLookup(first.log_light, first.grey, np.gradient(first.grey, first.log_light))
     log_t = np.log(samples.exposure) + LN2 * first.correction_ev
-    fair = np.zeros(samples.grey.shape, bool)
+    reliable = np.zeros(samples.grey.shape, bool)
     for channel in np.unique(samples.channel):
         rows = samples.channel == channel
         of_channel = samples.take(rows)
         limits, sigma = of_channel.limits, of_channel.sigma
         light = np.stack([project(lookup, of_channel.without(n), log_t) for n in range(len(log_t))], axis=1)
-        fair[rows] = fairly_inside(of_channel.grey, light, limits, sigma)
-    return replace(samples, fair=fair)
+        reliable[rows] = reliably_inside(of_channel.grey, light, limits, sigma)
+    return replace(samples, reliable=reliable)
 
 
-# ── what the fit says of itself ──────────────────────────────────────────────────────────────────────────────────
+# ── assessment and result ────────────────────────────────────────────────────────────────────────────────────────
 
 
 def residual_structure(grey: Array, residual: Array, bins: int = 16) -> float:
-    """Size in grey levels of what the residuals share at one grey: rms of their means by grey, noise taken off."""
-    place = np.digitize(grey, np.quantile(grey, np.linspace(0, 1, bins + 1)[1:-1]))
-    number = np.bincount(place, minlength=bins)
+    """RMS of the systematic residual in grey levels: of the mean residuals by grey, contribution of noise removed."""
+    grey_bin = np.digitize(grey, np.quantile(grey, np.linspace(0, 1, bins + 1)[1:-1]))
+    number = np.bincount(grey_bin, minlength=bins)
     good = number > 20
-    mean = np.bincount(place, residual, minlength=bins)[good] / number[good]
-    square = np.bincount(place, residual**2, minlength=bins)[good] / number[good]
+    mean = np.bincount(grey_bin, residual, minlength=bins)[good] / number[good]
+    square = np.bincount(grey_bin, residual**2, minlength=bins)[good] / number[good]
     excess = mean**2 - (square - mean**2) / number[good]
     return float(np.sqrt(max(float(excess.mean()), 0.0))) if good.any() else 0.0
 
@@ -326,24 +329,24 @@ def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
     notes = []
     chosen, trials, final, structure = verdict.chosen, verdict.trials, verdict.final, verdict.structure_levels
     tabulated = trials["table"]
-    if chosen != "table" and _beaten(trials[chosen], tabulated):
+    if chosen != "table" and significantly_worse(trials[chosen], tabulated):
         before = trials[chosen].held_out_rms
         gain = 1.0 - tabulated.held_out_rms / max(before, 1e-9)
         notes.append(
-            f"{chosen} does not follow the data: residuals share {structure:.2f} grey levels at one grey; a table "
+            f"{chosen} does not fit the data: systematic residual of {structure:.2f} grey levels; a table "
             f"lowers the held-out rms from {before:.2f} to {tabulated.held_out_rms:.2f} ({gain:.0%}): "
             "--kind table"
         )
     elif structure > STRUCTURE_LEVELS:
-        notes.append(f"structure in the residuals over grey level: {structure:.2f} levels that no kind explains")
+        notes.append(f"systematic residual of {structure:.2f} grey levels that no kind explains")
     if chosen == "table" and "five_segment" in trials:
         five = trials["five_segment"].held_out_rms
         table = tabulated.held_out_rms
-        notes.append(f"no simpler kind follows: held-out rms {five:.2f} with five_segment, {table:.2f} with table")
+        notes.append(f"no simpler kind fits: held-out rms {five:.2f} with five_segment, {table:.2f} with table")
     if verdict.scatter_ev > SCATTER_EV:
         notes.append(
             f"the listed exposures agree to {verdict.scatter_ev:.2f} EV only: flicker, or several are wrong "
-            "(is ISO counted?) and too few right to tell which"
+            "(is ISO included?) and too few are right to tell which"
         )
     if len(samples.exposure) < MIN_PICTURES:
         notes.append(f"{len(samples.exposure)} pictures are too few to find wrong exposures")
@@ -353,8 +356,8 @@ def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
     open_levels = verdict.posterior.rms_levels
     if open_levels > OPEN_LEVELS:
         notes.append(
-            f"the pictures hold the curve to {open_levels:.1f} grey levels rms only"
-            f"{', the rest is the kind' * (chosen != 'table')}: more exposures, closer together, hold it better"
+            f"the pictures determine the curve to {open_levels:.1f} grey levels rms only"
+            f"{', the kind determines the rest' * (chosen != 'table')}: take more exposures, closer together"
         )
     if (final.curve.encode(np.array([1.0])) * 255)[0] - samples.top > 25:
         notes.append(f"no grey above {samples.top:.0f} was seen: the curve is extrapolated there")
@@ -371,14 +374,14 @@ def _result(
     final = verdict.final
     log_t = np.log(samples.exposure) + LN2 * final.correction_ev
     lookup = log_lookup(final.curve)
-    left = residual_of(lookup, samples, final.correction_ev)
+    residual = residual_of(lookup, samples, final.correction_ev)
     log_light = project(lookup, samples, log_t)[:, None] + log_t
     use = samples.measured
     ends = lookup.light(np.quantile(samples.grey[use], [0.001, 0.999]))
     scale = float(np.exp(ends[1])) if final.family.kind in ("five_segment", "table") else 1.0
-    cloud = DataCloud(np.exp(log_light[use]) / scale, samples.grey[use], left[use], np.nonzero(use)[1])
-    verdicts = _verdicts(pictures, seen, final)
-    for picture in verdicts:
+    cloud = DataCloud(np.exp(log_light[use]) / scale, samples.grey[use], residual[use], np.nonzero(use)[1])
+    picture_fits = _picture_fits(pictures, seen, final)
+    for picture in picture_fits:
         if picture.contradicts:
             notes.append(
                 f"{picture.file}: its listed exposure {picture.exposure:.6g} contradicts the others by "
@@ -386,20 +389,20 @@ def _result(
             )
     return CurveFit(
         scale_exposure(final.curve, scale),
-        rms_levels(left[use]),
-        float(np.hypot(verdict.std_levels, samples.ends.spread_levels if samples.ends.apart else 0.0)),
+        rms_levels(residual[use]),
+        float(np.hypot(verdict.std_levels, samples.ends.rms_difference_levels if samples.ends.differ else 0.0)),
         (float(np.exp(ends[0]) / scale), float(np.exp(ends[1]) / scale)),
-        verdicts,
+        picture_fits,
         tuple(notes),
         {name: trial.held_out_rms for name, trial in verdict.trials.items()},
         cloud,
     )
 
 
-def _verdicts(pictures: Sequence[BracketPicture], seen: NDArray[np.bool_], final: Trial) -> tuple[PictureFit, ...]:
-    believed = final.correction_ev[~final.suspect]
+def _picture_fits(pictures: Sequence[BracketPicture], seen: NDArray[np.bool_], final: Trial) -> tuple[PictureFit, ...]:
+    trusted = final.correction_ev[~final.suspect]
     error = np.full(len(pictures), np.nan)
-    error[seen] = (np.median(believed) if len(believed) else 0.0) - final.correction_ev
+    error[seen] = (np.median(trusted) if len(trusted) else 0.0) - final.correction_ev
     contradicts = np.zeros(len(pictures), bool)
     contradicts[seen] = final.suspect
     return tuple(
@@ -409,7 +412,7 @@ def _verdicts(pictures: Sequence[BracketPicture], seen: NDArray[np.bool_], final
 
 
 def scale_exposure(curve: ResponseCurve, unit: float) -> ResponseCurve:
-    """The same curve over exposures counted in ``unit``; only kinds that carry their own axis change."""
+    """The curve with its exposure axis in units of ``unit``; only kinds with an axis of their own change."""
     if curve.kind == "five_segment":
         return replace(curve, b=(curve.b[0] / unit, curve.b[1]), c=(curve.c[0] / unit, curve.c[1]))
     if curve.kind == "table":
@@ -420,10 +423,10 @@ def scale_exposure(curve: ResponseCurve, unit: float) -> ResponseCurve:
 def curve_distance_levels(
     curve: ResponseCurve, truth: ResponseCurve, exposure: tuple[float, float], points: int = 400
 ) -> float:
-    """Rms difference of two curves in grey levels over a range of ``curve``'s exposures, at the best common scale.
+    """RMS difference of two curves in grey levels over a range of ``curve``'s exposures, at the best relative scale.
 
-    The exposure axis has no absolute scale, so the factor between the two axes that makes them most alike is taken.
-    The points lie evenly in the grey of ``curve``.
+    The exposure axis has no absolute scale, so the factor between the two axes with the least difference is used.
+    Points are spaced evenly in the grey of ``curve``.
     """
     ends = curve.encode(np.array(exposure))
     light = np.unique(curve.linearise(np.linspace(float(ends[0]), float(ends[1]), points)))

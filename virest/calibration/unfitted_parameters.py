@@ -1,4 +1,4 @@
-"""What a calibration held fixed although the points contradict it: told by one more fit, in which nothing is."""
+"""Values that a calibration held fixed but the tracked points contradict, found by one more fit with all free."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import TrackFit, fit_tracks
 from virest.inference.tracking_bias import bias_std
 
-_PLACES = ("intrinsics", "imu", "shutter")
+_SECTIONS = ("intrinsics", "imu", "shutter")
 _NAMED = sorted(
     (effect for effect in EFFECTS.values() if effect.calibrated is not None and effect.calibrated.option),
-    key=lambda effect: _PLACES.index(effect.place.partition(".")[0]),
+    key=lambda effect: _SECTIONS.index(effect.place.partition(".")[0]),
 )
 _CALIBRATED = {effect.calibrated.option: effect.calibrated for effect in _NAMED if effect.calibrated is not None}
 OPTIONAL = {option: terms_of.TERMS[effect.name] for option, effect in zip(_CALIBRATED, _NAMED, strict=True)}
-"""What ``--with`` adds to the fit of points: of the lens, of the inertial sensor, of the shutter."""
+"""Terms that ``--with`` adds to the fit: lens, inertial sensor, shutter."""
 TWINS = {"focal": "gyro-scale", "gyro-scale": "focal"}
-"""What turns about the picture's axes tell only the product of; turns about the optical axis tell the two apart."""
+"""Pairs of which pitch and yaw determine only the product; roll separates them."""
 TWIN_SIGMA, TWIN_STD = 3.0, 0.01
-"""A twin held fixed is reported as wrong above this many deviations, and as undetermined above this part of itself."""
+"""A fixed twin is reported as wrong above this many σ, and as undetermined above this relative standard deviation."""
 WRONG_SIGMA = 6.0
-"""Any other value held fixed is reported as wrong above this many deviations."""
+"""Any other fixed value is reported as wrong above this many σ."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeldValue:
-    """A value that was not fitted, as the points would have it."""
+    """A value that the calibration held fixed, as estimated by the fit with all values free."""
 
     name: str
-    """As in OPTIONAL."""
+    """Key of OPTIONAL."""
     change: NDArray[np.float64]
-    """(k,) from where it was held, in its term's units."""
+    """(k,) change from the fixed value, in the term's units."""
     std: NDArray[np.float64]
-    """(k,), with tracking's own bias."""
+    """(k,) standard deviation, including tracking bias."""
 
     @property
     def sigma(self) -> float:
-        """The largest change in units of its deviation."""
+        """Largest change in standard deviations."""
         return float(np.max(np.abs(self.change) / self.std))
 
     @property
     def believable(self) -> bool:
-        """Whether a phone can be like that."""
+        """Whether the change is plausible for a phone."""
         return bool(np.all(np.abs(self.change) <= _CALIBRATED[self.name].believable))
 
     def __str__(self) -> str:
@@ -64,9 +64,10 @@ class HeldValue:
 def held_values(
     imu: ImuSamples, table: TrackTable, fit: TrackFit, noise_px: float, exposures_vary: bool
 ) -> dict[str, HeldValue]:
-    """All that a fit held fixed, as a fit that holds nothing finds it; by its name in OPTIONAL.
+    """Fit once more with all optional terms free: the values that ``fit`` held fixed, by key of OPTIONAL.
 
-    noise_px: what tracking alone makes.  exposures_vary: where they do not, an exposure's scale is an offset.
+    noise_px: tracking noise.  exposures_vary: if not, an exposure scale is indistinguishable from a time offset and is
+    left out.
     """
     fitted = {term.name for term in fit.terms}
     wanted = {
@@ -82,13 +83,13 @@ def held_values(
 
 
 def held_notes(held: dict[str, HeldValue], fitted: Sequence[str]) -> list[str]:
-    """What to say of them; fitted: names of those in OPTIONAL that were fitted."""
-    notes, said = [], set()
+    """Notes on contradicted or undetermined fixed values; fitted: keys of OPTIONAL that were fitted."""
+    notes, reported = [], set()
     for name in fitted:
         twin = held.get(TWINS.get(name, ""))
         if twin is None:
             continue
-        said.add(twin.name)
+        reported.add(twin.name)
         if twin.sigma > TWIN_SIGMA:
             pair = f"--with {','.join([*fitted, twin.name])}"
             notes.append(f"{name} is absorbing a wrong {twin}, which the points contradict; fit both: {pair}")
@@ -97,7 +98,7 @@ def held_notes(held: dict[str, HeldValue], fitted: Sequence[str]) -> list[str]:
                 f"{name} depends on {twin.name}, which was held fixed and is determined by this motion to "
                 f"± {twin.std[0]:.1%} only; also rotate the phone about its optical axis"
             )
-    wrong = [value for name, value in held.items() if name not in said and value.sigma > WRONG_SIGMA]
+    wrong = [value for name, value in held.items() if name not in reported and value.sigma > WRONG_SIGMA]
     if wrong and all(value.believable for value in wrong):
         names = ",".join([*fitted, *(value.name for value in wrong)])
         notes.append(

@@ -1,1 +1,1 @@
-"""How good is it?  Pictures against their truth, and against other methods given the same advantages."""
+"""Evaluation: restored frames against ground truth, and against other methods given the same information."""

@@ -1,8 +1,8 @@
-"""Other people's deblurring at its best: true centre kernel, no circular border, the best of some settings.
+"""Published deblurring methods at their best: true centre kernel, blended borders, best of several settings.
 
-One kernel serves the whole picture, as in the paper's Table 1 and in scikit-image; the picture goes on blended around
-its edges, and the result is straightened by the same warp as ours.  scikit-image is loaded only when it is asked for.
-Kernels here are *convolutions*; ours are correlations, so they are turned round.
+One kernel is used for the whole image, as in the paper's Table 1 and in scikit-image.  The image is extended by a
+border that blends opposite edges, and the result is straightened by the same warp as ours.  scikit-image is imported
+only when used.  Kernels here are for *convolution*; ours are for correlation, so they are flipped.
 """
 
 from __future__ import annotations
@@ -29,39 +29,39 @@ Plane = NDArray[np.float32]
 Deconvolve = Callable[[Plane, Plane, Any], Plane]
 ANCHOR = 0.5
 BORDER_RADII = 2
-"""The blended border is this many kernel radii wide on each side."""
+"""Minimum width of the blended border on each side, in kernel radii."""
 STRAIGHT_SAMPLES_PER_PX = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """A method that is compared with."""
+    """A method to compare with."""
 
     deconvolve: Deconvolve
-    """(plane, convolution kernel, setting) to plane."""
+    """(plane, convolution kernel, setting) → plane."""
     settings: tuple[Any, ...]
-    """All are tried on every frame; the best by squared error against truth counts."""
+    """Settings tried on every frame; the one with the least squared error against truth counts."""
     title: str
     straight: bool = False
-    """Takes the straight line of the paper's angle and length for the kernel, in place of the true path."""
+    """Uses a straight kernel of the paper's angle and length instead of the true blur path."""
     grey: bool = False
-    """Works on grey levels, as if they were light."""
+    """Works on grey levels instead of linear light."""
     library: str = ""
-    """What has to be installed."""
+    """Required package; empty: none."""
 
     @property
     def available(self) -> bool:
-        """Whether its library is there."""
+        """Whether the required package is installed."""
         return not self.library or find_spec(self.library) is not None
 
 
 def _inverse(plane: Plane, psf: Plane, least: float) -> Plane:
-    """1 / K, where K is larger than ``least``; below that its phase only."""
+    """Inverse filter 1 / K, with |K| clamped from below in the denominator: conj(K) / max(|K|, least)²."""
     return filtered(plane, psf, lambda k: np.conj(k) / np.maximum(np.abs(k), np.float32(least)) ** 2)
 
 
 def _wiener(plane: Plane, psf: Plane, noise_to_signal: float) -> Plane:
-    """Conj(K) / (|K|² + N/S), the same N/S at all frequencies."""
+    """Wiener filter conj(K) / (|K|² + N/S) with the same N/S at all frequencies."""
     return filtered(plane, psf, lambda k: np.conj(k) / (np.abs(k) ** 2 + np.float32(noise_to_signal)))
 
 
@@ -114,7 +114,7 @@ BASELINES = PAPERS | {f"skimage {name}": baseline for name, baseline in SCIKIT.i
 def baseline_pictures(
     baseline: Baseline, picture: Picture, motion: RowMotion, curve: ResponseCurve
 ) -> Iterator[Picture]:
-    """Restored and straightened pictures, one for each of the baseline's settings."""
+    """Restored and straightened frames, one per setting of the baseline."""
     source = rowwise_map(motion, ANCHOR)
     psf = straight_psf(motion) if baseline.straight else centre_psf(motion)
     for setting in baseline.settings:
@@ -129,7 +129,7 @@ def _with_setting(deconvolve: Deconvolve, psf: Plane, setting: Any, plane: Plane
 def deblurred(
     picture: Picture, deconvolve: Callable[[Plane], Plane], psf: Plane, curve: ResponseCurve | None
 ) -> Picture:
-    """One picture, channel by channel, in linear light; without a curve in grey levels."""
+    """Deblur a frame channel by channel, in linear light, or in grey levels without a curve."""
     curve = curve or ResponseCurve("linear")
     table = curve.linear_table()
     light = [deconvolved_inside(deconvolve, table[picture[..., k]], psf) for k in range(3)]
@@ -137,13 +137,13 @@ def deblurred(
 
 
 def centre_psf(motion: RowMotion) -> Plane:
-    """Give the true kernel at the picture's centre, zero at mid-exposure, as a convolution takes it."""
+    """True blur kernel at the frame's centre, for convolution, its origin at mid-exposure."""
     kernel = kernel_field(motion, _centre(motion), ANCHOR).arrays(positive=True)[0]
     return kernel[::-1, ::-1] / kernel.sum()
 
 
 def straight_psf(motion: RowMotion) -> Plane:
-    """The straight line of the paper's angle and length (eqs 15, 16) at the picture's centre, zero at its middle."""
+    """Straight kernel of the paper's angle and length (eqs 15, 16) at the frame's centre, its origin at the middle."""
     chord = blur_chords(motion, _centre(motion))[0]
     count = max(int(np.ceil(STRAIGHT_SAMPLES_PER_PX * np.linalg.norm(chord))), 1)
     part = (np.arange(count) + 0.5) / count - 0.5
@@ -156,23 +156,23 @@ def _centre(motion: RowMotion) -> NDArray[np.float64]:
 
 
 def deconvolved_inside(deconvolve: Callable[[Plane], Plane], plane: Plane, psf: Plane) -> Plane:
-    """Deconvolve a picture with a border that goes on smoothly around the corner, and cut the border off."""
+    """Deconvolve an image extended by a smooth periodic border, then crop the border."""
     border = BORDER_RADII * (psf.shape[0] // 2)
     result = deconvolve(blended(plane, border))
     return result[border : border + plane.shape[0], border : border + plane.shape[1]]
 
 
 def blended(plane: Plane, border: int) -> Plane:
-    """Widen on all sides by at least ``border``: mirror pictures of both edges, blended into each other by a cosine."""
+    """Extend periodically by at least ``border`` on all sides: mirrored edges, cross-faded by a raised cosine."""
     for axis in (0, 1):
         plane = _blended_rows(plane.swapaxes(0, axis), border).swapaxes(0, axis)
     return np.ascontiguousarray(plane)
 
 
 def _blended_rows(plane: Plane, border: int) -> Plane:
-    """After the last row comes its mirror picture, which fades into the one that leads to the first row."""
+    """Append rows that cross-fade the mirrored end of the plane into its mirrored start, then centre the plane."""
     between = next_fast_len(len(plane) + 2 * border, real=True) - len(plane)
-    part = (0.5 - 0.5 * np.cos(np.pi * (np.arange(between) + 0.5) / between)).astype(plane.dtype)
+    weight = (0.5 - 0.5 * np.cos(np.pi * (np.arange(between) + 0.5) / between)).astype(plane.dtype)
     after, before = plane[::-1][:between], plane[:between][::-1]
-    bridge = (1 - part)[:, None] * after + part[:, None] * before
+    bridge = (1 - weight)[:, None] * after + weight[:, None] * before
     return np.roll(np.concatenate([plane, bridge]), border, axis=0)

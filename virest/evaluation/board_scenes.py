@@ -1,7 +1,8 @@
-"""Boards before a leafy wall, and a camera that is moved fast from side to side: the paper's Case A, with truth.
+"""Calibration boards before a dead-leaves wall, seen by a camera moving fast sideways: the paper's Case A with truth.
 
-The chessboard and the AprilGrid are drawn at the chart's middle, far away (only turning shows) or near (travelling
-shows too).  The motion's direction is across the readout, where a rolling shutter shears most (the paper's Figure 15).
+The chessboard or AprilGrid is drawn at the chart's centre, at infinity (only rotation matters) or near (translation
+matters too).  The camera moves perpendicular to the readout direction, where a rolling shutter shears most (the paper's
+Figure 15).
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from virest.simulation.session import Session, SessionSettings, nominal_camera, 
 Chart = NDArray[np.float32]
 WHITE, BLACK = 0.8, 0.03
 FIELDS = (9, 7)
-"""Of the chessboard, along the longer side and across."""
+"""Chessboard squares along the longer and the shorter side."""
 TAGS = (5, 4)
-"""Of the AprilGrid."""
+"""AprilGrid tags along the longer and the shorter side."""
 TAG_SPACING = 0.3
-"""Side of the black squares between tags, part of a tag's."""
-BOARD_PART = 0.84
-"""Of the picture's shorter side that the board fills."""
+"""Side of the black squares between tags, as a fraction of a tag's side."""
+BOARD_FRACTION = 0.84
+"""Fraction of the frame's shorter side that the board fills."""
 MOTION_LEAD_S = 1.6
 MARGIN = 1.25
-"""How much further than the picture the chart reaches."""
+"""Extent of the chart relative to the field of view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +43,9 @@ class BoardSetting:
     height: int = 480
     frames: int = 12
     turn_rad_s: float = 2.2
-    """Amplitude of the sideways turning."""
+    """Amplitude of the sideways angular rate."""
     travel_m_s: float = 0.0
-    """Amplitude of the sideways travelling."""
+    """Amplitude of the sideways velocity."""
     depth_m: float = np.inf
     exposure_ms: float = 1.0
     readout_ms: float = 20.0
@@ -53,7 +54,7 @@ class BoardSetting:
 
 
 def board_session(setting: BoardSetting) -> Session:
-    """Plan a recording of a board by a phone that is moved fast across its readout."""
+    """Plan a recording of a board by a phone moving fast perpendicular to its readout direction."""
     nominal = nominal_camera(
         setting.width, setting.height, readout_time_s=setting.readout_ms / 1000, depth_m=setting.depth_m
     )
@@ -71,10 +72,10 @@ def board_session(setting: BoardSetting) -> Session:
 
 
 def sideways_motion(setting: BoardSetting) -> HandMotion:
-    """Turn and travel across the readout by one slow wave each, with a hand's tremor on all axes."""
+    """Rotation and translation perpendicular to the readout, one slow wave each, plus hand tremor on all axes."""
     rng = np.random.default_rng([setting.seed, 11])
-    upright = setting.height > setting.width
-    turn_axis, travel_axis = (0, 1) if upright else (1, 0)
+    portrait = setting.height > setting.width
+    turn_axis, travel_axis = (0, 1) if portrait else (1, 0)
     frequency, amplitude = rng.uniform(0.6, 9.0, (3, 6)), rng.uniform(0.0, 0.06, (3, 6)) * setting.turn_rad_s
     frequency[turn_axis, 0], amplitude[turn_axis, 0] = rng.uniform(1.6, 2.0), setting.turn_rad_s
     rate = Waves(frequency, amplitude, rng.uniform(0, 2 * np.pi, (3, 6)))
@@ -86,19 +87,21 @@ def sideways_motion(setting: BoardSetting) -> HandMotion:
 
 
 def board_scene(setting: BoardSetting, focal_px: float) -> Scene:
-    """A wall of leaves with a board on it, drawn finer than the picture and blurred by the lens."""
+    """Dead-leaves wall with a board on it, oversampled and blurred by the lens."""
     half = MARGIN * setting.width / (2 * focal_px) + 0.2, MARGIN * setting.height / (2 * focal_px) + 0.2
     rng = np.random.default_rng([setting.seed, 12])
     scene = make_scene("leaves", rng, focal_px=focal_px, half_extent=half)
-    finer = scene.chart_focal_px / focal_px
+    oversampling = scene.chart_focal_px / focal_px
     draw = _chessboard if setting.board == "chessboard" else _aprilgrid
-    light = draw(int(BOARD_PART * min(setting.width, setting.height) * finer), setting.width >= setting.height)
-    scene = replace(scene, chart=_hung(scene.chart, light, LENS_SIGMA_PX * finer))
+    light = draw(
+        int(BOARD_FRACTION * min(setting.width, setting.height) * oversampling), setting.width >= setting.height
+    )
+    scene = replace(scene, chart=_paste_board(scene.chart, light, LENS_SIGMA_PX * oversampling))
     return scene if np.isinf(setting.depth_m) else scene.at_plane(setting.depth_m)
 
 
 def _chessboard(short_px: int, landscape: bool) -> Chart:
-    """Fields with a white rim, the first one black."""
+    """Chessboard with a white rim half a square wide; the top-left square is black."""
     columns, rows = FIELDS if landscape else FIELDS[::-1]
     side = short_px // (min(FIELDS) + 1)
     odd = np.add.outer(np.arange(rows), np.arange(columns)) % 2
@@ -107,7 +110,7 @@ def _chessboard(short_px: int, landscape: bool) -> Chart:
 
 
 def _aprilgrid(short_px: int, landscape: bool) -> Chart:
-    """Tags 36h11, numbered row by row from below as Kalibr's, and black squares that touch their corners."""
+    """Tags 36h11, numbered row by row from the bottom as in Kalibr, with black squares touching their corners."""
     columns, rows = TAGS if landscape else TAGS[::-1]
     cell = int(short_px / (min(TAGS) * (1 + TAG_SPACING) + TAG_SPACING + 0.4) / 8)
     tag, gap = 8 * cell, round(TAG_SPACING * 8 * cell)
@@ -124,8 +127,8 @@ def _aprilgrid(short_px: int, landscape: bool) -> Chart:
     return np.pad(sheet, gap, constant_values=WHITE)
 
 
-def _hung(chart: Chart, light: Chart, sigma_px: float) -> Chart:
-    """A board, as sharp as the lens shows it, in the middle of a chart that has been through the lens."""
+def _paste_board(chart: Chart, light: Chart, sigma_px: float) -> Chart:
+    """Paste a board into the centre of an already blurred chart, and apply the lens blur to it."""
     rim = int(4 * sigma_px) + 1
     top, left = ((whole - part) // 2 for whole, part in zip(chart.shape, light.shape, strict=False))
     result = chart.copy()

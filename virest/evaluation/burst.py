@@ -1,7 +1,7 @@
-"""Other people's ways to merge a frame with its neighbours, given the true motion: baselines for joint restoration.
+"""Published methods of merging a frame with its neighbours, given the true motion: baselines for joint restoration.
 
-The neighbours are brought to the frame's pixels by the same map as ours and merged in linear light, and the result is
-straightened by the same warp.  Neither method undoes a blur: they profit from neighbours that are blurred otherwise.
+Neighbours are aligned to the frame by the same map as ours and merged in linear light, and the result is straightened
+by the same warp.  Neither method deconvolves: they gain only from neighbours with a different blur.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ Picture = NDArray[np.uint8]
 Light = NDArray[np.float32]
 ANCHOR = 0.5
 REACHES = (1, 2, 3)
-"""Neighbours on each side that are tried."""
+"""Numbers of neighbours on each side to try."""
 EXPONENTS = (3.0, 11.0, 30.0)
-"""Of Fourier burst accumulation; the paper takes 11 (Delbracio & Sapiro 2015, doi:10.1109/CVPR.2015.7298855)."""
+"""Exponents of Fourier burst accumulation (11 in the paper: Delbracio & Sapiro 2015, doi:10.1109/CVPR.2015.7298855)."""
 SMOOTHED_SIDE = 50
-"""Its weights are smoothed over this part of the picture's shorter side (the paper's σ)."""
+"""The smoothing σ of its weights is the frame's shorter side divided by this, as in the paper."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlignedFrames:
-    """A frame and its neighbours in linear light, each brought to the frame's pixels."""
+    """A frame and its neighbours in linear light, aligned to the frame's pixels."""
 
     motion: RowMotion
-    """Of the frame."""
+    """Motion of the frame."""
     curve: ResponseCurve
     light: Mapping[int, Light]
-    """(height, width, 3) by the neighbour's distance in frames; 0: the frame itself."""
+    """(height, width, 3) by offset in frames; 0: the frame itself."""
 
     def within(self, reach: int) -> list[Light]:
-        """Those at most ``reach`` frames away, in order."""
+        """Images at most ``reach`` frames away, in order."""
         return [self.light[k] for k in sorted(self.light) if abs(k) <= reach]
 
     def straightened(self, light: Light) -> Picture:
-        """Grey levels of a merged picture, every row brought to the reference time."""
+        """Grey levels of a merged image, every row warped to the reference time."""
         planes = [np.ascontiguousarray(light[..., k]) for k in range(3)]
         return warp(encode_picture(planes, self.curve), rowwise_map(self.motion, ANCHOR))
 
@@ -61,7 +61,7 @@ def align_frames(
     trajectory: Trajectory,
     lens: MovingLens,
 ) -> AlignedFrames:
-    """Bring pictures (by their index in the movie) to the pixels of frame ``here``."""
+    """Align frames, given with their movie index, to the pixels of frame ``here``."""
     motion = motions[here]
     curve = motion.profile.response or ResponseCurve("srgb")
     table = curve.linear_table()
@@ -76,16 +76,16 @@ def align_frames(
 
 
 def align_and_average(frames: AlignedFrames) -> Iterator[Picture]:
-    """The mean of the aligned frames, for each reach."""
+    """Mean of the aligned frames, for each reach."""
     for reach in REACHES:
         yield frames.straightened(np.mean(frames.within(reach), axis=0, dtype=np.float32))
 
 
 def fourier_burst(frames: AlignedFrames) -> Iterator[Picture]:
-    """Fourier burst accumulation, for each reach and exponent.
+    """Fourier burst accumulation, for each reach and exponent (Delbracio & Sapiro 2015, eq. 4).
 
-    Σ w_i F_i with w_i = |G F_i|^p / Σ |G F_j|^p: at each frequency the frames count by their smoothed magnitude there,
-    averaged over the colours (Delbracio & Sapiro 2015, eq. 4).
+    Σ w_i F_i with w_i = |G F_i|^p / Σ |G F_j|^p: at each frequency a frame is weighted by its smoothed magnitude,
+    averaged over the colours.
     """
     spectra = {k: np.asarray(fft.rfft2(light, axes=(0, 1))) for k, light in frames.light.items()}
     height, width = frames.motion.profile.height, frames.motion.profile.width
@@ -101,7 +101,7 @@ def fourier_burst(frames: AlignedFrames) -> Iterator[Picture]:
 
 
 def _smoothed(magnitude: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """A half spectrum's magnitude under a Gaussian; frequencies go around along y and are mirrored at x = 0."""
+    """Gaussian-smoothed magnitude of a half spectrum, periodic along y and mirrored along x."""
     border = int(np.ceil(3 * sigma))
     around = np.pad(np.pad(magnitude, ((border, border), (0, 0)), mode="wrap"), ((0, 0), (border, border)), "reflect")
     smooth = cv2.GaussianBlur(around.astype(np.float32), (0, 0), sigma)

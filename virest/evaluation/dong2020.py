@@ -1,11 +1,12 @@
-"""Deconvolution of a Poisson picture with total variation and an L0 norm of its gradients.
+"""Non-blind deconvolution under Poisson noise with total-variation and L0 gradient regularisation.
 
 After Dong, Tao, Xu & Chen 2020 (doi:10.1109/TIP.2020.3038518, the paper's "Wang"), with the kernel given:
 
     min over f ≥ 0 of  photons Σ (K f − g log K f)  +  tv Σ |∇f|  +  l0 #(∇f ≠ 0)
 
-by alternating directions: K f, ∇f for the total variation and ∇f for the L0 norm are split off, each has a closed
-step, and f follows by one division of spectra.  The picture is taken to go on around its edges: blend them first.
+solved by ADMM: K f, ∇f for the total variation and ∇f for the L0 norm are split off, each with a closed-form step, and
+f follows from one division in the frequency domain.  The image is treated as periodic, so its edges must be blended
+first.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ Spectrum = NDArray[Any]
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """What counts how much."""
+    """Weights and penalties of the objective."""
 
     photons: float = 2000.0
-    """At light 1: the data's weight."""
+    """Photon count at light 1; the weight of the data term."""
     tv: float = 60.0
     l0: float = 1.0
     iterations: int = 25
@@ -36,7 +37,7 @@ class Weights:
 
 
 def poisson_tv_l0(observed: Plane, psf: Plane, weights: Weights) -> Plane:
-    """Deconvolve light (height, width) ≥ 0, blurred by a convolution with ``psf`` about its middle."""
+    """Deconvolve light (height, width) ≥ 0 that was convolved with ``psf``, whose origin is at its centre."""
     shape = observed.shape
     kernel = centred_spectrum(psf, shape)
     across, down = (centred_spectrum(np.array(d, np.float32), shape) for d in ([[1, -1, 0]], [[1], [-1], [0]]))
@@ -61,33 +62,33 @@ def poisson_tv_l0(observed: Plane, psf: Plane, weights: Weights) -> Plane:
 
 
 def centred_spectrum(psf: Plane, shape: tuple[int, ...]) -> Spectrum:
-    """Spectrum of a kernel whose middle lies at the origin, on a plane of ``shape``."""
+    """Spectrum, on a plane of ``shape``, of a kernel centred on the origin."""
     placed = np.zeros(shape, np.float32)
     placed[: psf.shape[0], : psf.shape[1]] = psf
     return _spectrum(np.roll(placed, (-(psf.shape[0] // 2), -(psf.shape[1] // 2)), axis=(0, 1)))
 
 
 def filtered(plane: Plane, psf: Plane, factor: Callable[[Spectrum], Spectrum]) -> Plane:
-    """A plane by one division of spectra: the factor's spectrum, made of the kernel's, times the plane's."""
+    """Filter a plane in the frequency domain by ``factor(K)``, K being the kernel's spectrum."""
     return _plane(_spectrum(plane) * factor(centred_spectrum(psf, plane.shape)), plane.shape)
 
 
 def _poisson_step(near: Plane, observed: Plane, photons: float, penalty: float) -> Plane:
-    """argmin over w of photons (w − g log w) + penalty/2 (w − near)²: the positive root of a quadratic."""
+    """Minimise photons (w − g log w) + penalty/2 (w − near)² over w: the positive root of a quadratic."""
     ratio = np.float32(photons / penalty)
     half = 0.5 * (near - ratio)
     return np.asarray(half + np.sqrt(half * half + ratio * observed), np.float32)
 
 
 def _shrunk(right: Plane, below: Plane, threshold: float) -> tuple[Plane, Plane]:
-    """Gradients shortened by the threshold (isotropic total variation)."""
+    """Shrink gradients by the threshold (isotropic total variation)."""
     length = np.sqrt(right * right + below * below)
     factor = np.maximum(1 - np.float32(threshold) / np.maximum(length, np.float32(1e-8)), np.float32(0))
     return right * factor, below * factor
 
 
 def _thresholded(right: Plane, below: Plane, part: float) -> tuple[Plane, Plane]:
-    """Gradients whose squared length is below 2 × part set to nothing (the L0 norm)."""
+    """Set gradients with a squared length of at most 2 × part to zero (L0 norm)."""
     kept = (right * right + below * below) > 2 * part
     return right * kept, below * kept
 

@@ -1,7 +1,7 @@
-"""How close a picture is to its truth: MSE, PSNR, SSIM, difference maps, where points lie, how far all is shifted.
+"""Fidelity of an image to its truth: MSE, PSNR, SSIM, difference map, point displacement, global shift.
 
-Pictures are 8-bit, (height, width) or (height, width, channels).  PSNR = 10 log10(255² / MSE) always: a table that
-gives both gives them of the same squared error.
+Images are 8-bit, (height, width) or (height, width, channels).  PSNR is always 10 log10(255² / MSE), so a table that
+gives both is consistent.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SHIFT_SMOOTHING_PX, SHIFT_STEPS = 1.5, 6
 
 @dataclass(frozen=True, slots=True)
 class Fidelity:
-    """One picture against its truth."""
+    """Fidelity of one image to its truth."""
 
     mse: float
     """Mean squared error over all pixels and channels, grey levels²."""
@@ -38,42 +38,42 @@ class Fidelity:
 
     @property
     def psnr_db(self) -> float:
-        """Of this MSE; infinite for equal pictures."""
+        """PSNR for this MSE; infinite for identical images."""
         return psnr_of(self.mse)
 
 
 def fidelity(picture: Picture, truth: Picture) -> Fidelity:
-    """Compare two pictures of one size, cut to what is to be compared."""
+    """Compare two images of equal size, already cropped to the region of interest."""
     return Fidelity(mean_squared_error(picture, truth), structural_similarity(picture, truth))
 
 
 def mean_squared_error(picture: Picture, truth: Picture) -> float:
-    """Grey levels², over all pixels and channels."""
+    """Mean squared error over all pixels and channels, grey levels²."""
     return float(np.mean((picture.astype(np.float64) - truth.astype(np.float64)) ** 2))
 
 
 def psnr_of(mse: float) -> float:
-    """Peak signal-to-noise ratio in dB of a mean squared error in grey levels²."""
+    """Peak signal-to-noise ratio in dB for a mean squared error in grey levels²."""
     return float(10 * np.log10(PEAK**2 / mse)) if mse > 0 else float("inf")
 
 
 def structural_similarity(picture: Picture, truth: Picture) -> float:
     """Mean SSIM over pixels and channels (Wang et al. 2004, doi:10.1109/TIP.2003.819861).
 
-    Means, variances and covariance under a Gaussian of 1.5 px, 11 x 11; pixels whose window leaves the picture do not
-    count.
+    Means, variances and covariance use an 11 × 11 Gaussian window of σ = 1.5 px.  Pixels whose window leaves the image
+    are excluded.
     """
     first, second = (p.reshape(*p.shape[:2], -1).astype(np.float64) for p in (picture, truth))
     near = [_windowed(p) for p in (first, second, first * first, second * second, first * second)]
     mean_1, mean_2, square_1, square_2, product = near
     c1, c2 = (SSIM_K1 * PEAK) ** 2, (SSIM_K2 * PEAK) ** 2
-    likeness = (2 * mean_1 * mean_2 + c1) * (2 * (product - mean_1 * mean_2) + c2)
-    size = (mean_1**2 + mean_2**2 + c1) * (square_1 - mean_1**2 + square_2 - mean_2**2 + c2)
-    return float(np.mean(likeness / size))
+    numerator = (2 * mean_1 * mean_2 + c1) * (2 * (product - mean_1 * mean_2) + c2)
+    denominator = (mean_1**2 + mean_2**2 + c1) * (square_1 - mean_1**2 + square_2 - mean_2**2 + c2)
+    return float(np.mean(numerator / denominator))
 
 
 def difference_map(picture: Picture, truth: Picture) -> Picture:
-    """|picture − truth| of the luma, (height, width): black where both agree (the paper's Figure 19)."""
+    """|picture − truth| of the luma (height, width); black where they agree (the paper's Figure 19)."""
     return np.asarray(cv2.absdiff(_grey(picture), _grey(truth)), np.uint8)
 
 
@@ -84,28 +84,28 @@ def psnr_db(picture: Picture, truth: Picture, valid_px: Sequence[int], margin_px
 
 
 def inner_part(valid_px: Sequence[int], margin_px: int = MARGIN_PX) -> tuple[slice, slice]:
-    """Rows and columns of a rectangle (x0, y0, x1, y1), the last two one past the end, less a margin."""
+    """Row and column slices of a rectangle (x0, y0, x1, y1), end exclusive, shrunk by a margin."""
     x0, y0, x1, y1 = valid_px
     return slice(y0 + margin_px, y1 - margin_px), slice(x0 + margin_px, x1 - margin_px)
 
 
 def point_distances_px(picture: Picture, truth: Picture, valid_px: Sequence[int]) -> Array:
-    """How far corners of the truth lie from where the picture shows them, (n,): Lucas-Kanade, forwards and back."""
+    """Displacements (n,) of the truth's corners in the picture, by Lucas–Kanade with a forward–backward check."""
     grey_truth, grey = (_grey(p) for p in (truth, picture))
     points = find_corners(grey_truth, TRACKING)
-    found, ahead = _follow(grey_truth, grey, points)
-    returned, back = _follow(grey, grey_truth, ahead)
+    found, forward = _follow(grey_truth, grey, points)
+    returned, backward = _follow(grey, grey_truth, forward)
     x0, y0, x1, y1 = valid_px
-    inside = [(p[:, 0] >= x0) & (p[:, 0] < x1) & (p[:, 1] >= y0) & (p[:, 1] < y1) for p in (points, ahead)]
+    inside = [(p[:, 0] >= x0) & (p[:, 0] < x1) & (p[:, 1] >= y0) & (p[:, 1] < y1) for p in (points, forward)]
     good = found & returned & inside[0] & inside[1]
-    good &= np.linalg.norm(back - points, axis=-1) < MAX_FORWARD_BACKWARD_PX
-    return np.linalg.norm(ahead - points, axis=-1)[good].astype(float)
+    good &= np.linalg.norm(backward - points, axis=-1) < MAX_FORWARD_BACKWARD_PX
+    return np.linalg.norm(forward - points, axis=-1)[good].astype(float)
 
 
 def shift_px(picture: Picture, truth: Picture, valid_px: Sequence[int], margin_px: int = MARGIN_PX) -> Array:
-    """How far the whole picture lies beside its truth, (x, y): least squares of the smoothed pictures.
+    """Global shift (x, y) of the picture against its truth: least squares on the smoothed images.
 
-    Phase correlation is no help here: blur turns the phases that it averages, and its peak jumps by whole pixels.
+    Phase correlation is unsuitable: blur alters the phases that it averages, and its peak jumps by whole pixels.
     """
     inside = inner_part(valid_px, margin_px)
     truth_grey, grey = (_smooth_grey(p) for p in (truth, picture))

@@ -1,7 +1,7 @@
-"""How many points of a picture are found again in its truth: what tracking and matching gain from a restoration.
+"""Feature matches between an image and its truth: what feature matching gains from a restoration.
 
-SIFT (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) as OpenCV has it by default, brute force over its descriptors
-(L2), and Lowe's ratio test, all on the luma.
+SIFT (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) with OpenCV's defaults, brute-force L2 matching and Lowe's
+ratio test, all on the luma.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ METHOD = f"SIFT (OpenCV's defaults), brute force L2, ratio {RATIO:g}; in place: 
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """Points of two pictures that look alike."""
+    """Feature matches between two aligned images."""
 
     good: int
-    """Those whose best match is clearly better than the second best."""
+    """Matches that pass the ratio test."""
     in_place: int
-    """Those of them that lie where they should, in pictures laid over each other."""
+    """Those of them that are within IN_PLACE_PX of the correct position."""
 
 
 def count_matches(picture: Picture, truth: Picture) -> Matches:
-    """Match a picture's points to its truth's; RGB, the same size, in the same place."""
+    """Match the features of a picture to its truth's; both RGB or grey, of equal size and aligned."""
     (points, descriptors), (true_points, true_descriptors) = (_described(p) for p in (picture, truth))
     if len(points) == 0 or len(true_points) < 2:
         return Matches(0, 0)
@@ -43,7 +43,7 @@ def count_matches(picture: Picture, truth: Picture) -> Matches:
 
 
 def _described(picture: Picture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Places (n, 2) and descriptors (n, 128) of a picture's points."""
+    """Positions (n, 2) and descriptors (n, 128) of an image's features."""
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     detector = cv2.SIFT_create()  # type: ignore[attr-defined]
     points, descriptors = detector.detectAndCompute(grey, None)

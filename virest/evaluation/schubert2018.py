@@ -1,8 +1,8 @@
-"""Straightening by a constant velocity of the picture, found in the pictures alone: no gyroscope, no perspective.
+"""Rolling-shutter correction by a constant image velocity, from the frames alone: no gyroscope, no perspective.
 
-After Schubert, Demmel, Usenko, Stückler & Cremers 2018 (ECCV, Direct sparse odometry with rolling shutter): while a
-frame is read the motion is taken as constant, and each row is moved back by what it has moved since the first.  Here
-the velocity is that of the picture, affine over it, from points followed to the frames before and after.
+After Schubert, Demmel, Usenko, Stückler & Cremers 2018 (ECCV, Direct sparse odometry with rolling shutter): motion is
+taken as constant during the readout, and each row is moved back by its motion since the first row.  Here the motion is
+an affine image velocity field, fitted to points tracked to the previous and next frames.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ FIXED_POINT_STEPS = 8
 
 @dataclass(frozen=True, slots=True)
 class PictureVelocity:
-    """Velocity of image points, the same at all times of one frame."""
+    """Affine velocity field of image points, constant during one frame."""
 
     centre_px: Array
-    """(2,) picture's centre."""
+    """(2,) centre of the frame."""
     terms: Array
-    """(3, 2): px/s at the centre, and its change per pixel of x and of y, 1/s."""
+    """(3, 2): velocity at the centre, px/s, and its derivatives along x and y, 1/s."""
 
     def at(self, points_px: Array) -> Array:
         """Velocity (..., 2) in px/s at points (..., 2)."""
@@ -46,10 +46,10 @@ def fit_velocity(
     width: int,
     height: int,
 ) -> PictureVelocity | None:
-    """Fit a frame's velocity to the points that it shares with its neighbours; None: too few.
+    """Fit a frame's velocity field to points tracked to its neighbours; None if there are too few.
 
-    d = v(p) Δt, Δt between the middles of the exposures of the rows that see the point.  middle_s: of the first row's
-    exposure, by frame.  Robust: reweighted least squares (Cauchy).
+    d = v(p) Δt, Δt between the mid-exposures of the rows that see the point.  middle_s: mid-exposure of the first row,
+    by frame.  Robust: iteratively reweighted least squares (Cauchy).
     """
     found = [_displacements(pair, frame, middle_s, shutter, width, height) for pair in pairs if frame in _both(pair)]
     if not found or sum(len(points) for points, _, _ in found) < MIN_POINTS:
@@ -70,9 +70,9 @@ def fit_velocity(
 def velocity_map(
     velocity: PictureVelocity, shutter: Shutter, width: int, height: int, since_reference_s: float
 ) -> NDArray[np.float32]:
-    """Where each pixel of the straightened picture was recorded, (height, width, 2).
+    """Source pixel in the recorded frame of each pixel of the straightened one, (height, width, 2).
 
-    since_reference_s: from the time of the straightened picture to the middle of the first row's exposure.
+    since_reference_s: time from the straightened frame's reference time to the first row's mid-exposure.
     """
     pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
     speed, seen = velocity.at(pixels), pixels
@@ -89,7 +89,7 @@ def _both(pair: TrackPair) -> tuple[int, int]:
 def _displacements(
     pair: TrackPair, frame: int, middle_s: Mapping[int, float], shutter: Shutter, width: int, height: int
 ) -> tuple[Array, Array, Array]:
-    """Points in the frame (n, 2), how far they lie from there in the other one (n, 2), and the time between (n,)."""
+    """Points in the frame (n, 2), their displacements to the other frame (n, 2) and the time between (n,)."""
     own, other = pair.points_first_px, pair.points_second_px
     if frame != pair.first:
         own, other = other, own

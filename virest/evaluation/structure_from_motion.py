@@ -1,9 +1,8 @@
-"""A camera's path from its pictures alone: COLMAP's incremental structure from motion (Schönberger & Frahm 2016).
+"""Camera trajectory from frames alone: COLMAP's incremental structure from motion (Schönberger & Frahm 2016).
 
-The lens is known and held, pictures are matched with their neighbours in time, and every random choice hangs on a
-seed.  Features, matching and adjustment are COLMAP's own (doi:10.1109/CVPR.2016.445); nothing here knows of gyroscopes
-or rows.
-pycolmap works on files: a folder of pictures, and a folder of its own for the database.
+The lens is known and fixed, frames are matched with their neighbours in time, and every random choice is seeded.
+Features, matching and bundle adjustment are COLMAP's (doi:10.1109/CVPR.2016.445); gyroscope and row times are not used.
+pycolmap works on files: a folder of frames and a working folder for its database.
 """
 
 from __future__ import annotations
@@ -27,53 +26,53 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class SfmSettings:
-    """How hard COLMAP looks."""
+    """Settings of COLMAP."""
 
     max_features: int = 500
-    """SIFT features of a picture."""
+    """Maximum SIFT features per frame."""
     overlap: int = 6
-    """Each picture is matched with this many following ones, and with those 8, 16, 32, … further on."""
+    """Each frame is matched with this many following frames, and with those 8, 16, 32, … frames later."""
     least_angle_deg: float = 6.0
-    """Least angle between the rays of the first pair; COLMAP's own 16 is for photographs, not for a short movie."""
+    """Minimum triangulation angle of the initial pair; COLMAP's default of 16° suits photographs, not a short movie."""
     threads: int = 1
-    """One: the same sums in the same order."""
+    """One thread keeps the order of summation, and so the result, reproducible."""
 
 
 @dataclass(frozen=True, slots=True)
 class SfmPath:
-    """What one run found; axes and scale are its own."""
+    """Result of one run, in arbitrary axes and scale."""
 
     pictures: tuple[str, ...]
-    """Names of the pictures with a pose, in order."""
+    """File names of the frames with a pose, in order."""
     position: Array
     """(n, 3) camera centres."""
     q_world_cam: Array
     """(n, 4) w x y z."""
     points: int
-    """Points of the scene."""
+    """Number of scene points."""
     reprojection_px: float
     """Mean reprojection error."""
 
 
 def require_pycolmap() -> Any:
-    """Import pycolmap, quiet but for errors. Raises SettingsError where it is not installed."""
-    asked_to_end = signal.getsignal(signal.SIGTERM)
+    """Import pycolmap and log only its errors.  Raises SettingsError if it is not installed."""
+    previous_handler = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
         raise SettingsError(
             "structure from motion needs pycolmap", hint="pip install 'virest[slam]', or give a SLAM by --command"
         ) from error
-    # its import takes SIGTERM for a crash and prints a stack; who asks the program to end shall be heard as before
-    if asked_to_end is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, asked_to_end)
+    # importing pycolmap installs a SIGTERM handler that reports a crash with a stack trace: restore the previous one
+    if previous_handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, previous_handler)
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.logging.alsologtostderr = False
     return pycolmap
 
 
 def colmap_camera(lens: Intrinsics) -> tuple[str, list[float]]:
-    """COLMAP's model and its parameters; its pixel (0.5, 0.5) is the centre of the top-left one."""
+    """COLMAP camera model and parameters; the centre of COLMAP's top-left pixel is (0.5, 0.5)."""
     pinhole = [lens.fx_px, lens.fy_px, lens.cx_px + 0.5, lens.cy_px + 0.5]
     if lens.model == "none" or not any(lens.coefficients):
         return ("OPENCV_FISHEYE", [*pinhole, 0.0, 0.0, 0.0, 0.0]) if lens.model == "fisheye" else ("PINHOLE", pinhole)
@@ -83,9 +82,9 @@ def colmap_camera(lens: Intrinsics) -> tuple[str, list[float]]:
 
 
 def match_pictures(pictures: Path, work: Path, lens: Intrinsics, settings: SfmSettings) -> Path:
-    """Find features in all pictures of a folder and match neighbours by descriptor; returns the database.
+    """Extract features of all frames in a folder and match neighbours by descriptor: path of the database.
 
-    No random choice is made here, so that runs with different seeds may share it.
+    This step is deterministic, so runs with different seeds can share the database.
     """
     colmap = require_pycolmap()
     database = work / "matches.db"
@@ -112,17 +111,17 @@ def match_pictures(pictures: Path, work: Path, lens: Intrinsics, settings: SfmSe
 
 
 def find_path(database: Path, work: Path, seed: int, settings: SfmSettings) -> SfmPath:
-    """Verify the matches and map, both from this seed; the largest model counts. No pictures: it found none."""
+    """Verify the matches and map, both with this seed; the largest model is returned, an empty one if mapping fails."""
     colmap = require_pycolmap()
-    own = work / f"seed_{seed}"
-    own.mkdir(parents=True)
-    verified = Path(shutil.copyfile(database, own / "verified.db"))
+    run_folder = work / f"seed_{seed}"
+    run_folder.mkdir(parents=True)
+    verified = Path(shutil.copyfile(database, run_folder / "verified.db"))
     colmap.set_random_seed(seed)
     verifier = colmap.GeometricVerifierOptions(num_threads=settings.threads)
     two_view = colmap.TwoViewGeometryOptions()
     two_view.ransac.random_seed = seed
     colmap.geometric_verification(verified, verifier, two_view_geometry_options=two_view)
-    models = colmap.incremental_mapping(verified, own, own, _mapping(colmap, seed, settings))
+    models = colmap.incremental_mapping(verified, run_folder, run_folder, _mapping(colmap, seed, settings))
     if not models:
         return SfmPath((), np.empty((0, 3)), np.empty((0, 4)), 0, float("nan"))
     return _path(max(models.values(), key=lambda model: model.num_reg_images()))
@@ -132,7 +131,7 @@ def find_path(database: Path, work: Path, seed: int, settings: SfmSettings) -> S
 
 
 def _mapping(colmap: Any, seed: int, settings: SfmSettings) -> Any:
-    """Incremental mapping with the lens held."""
+    """Options of incremental mapping with a fixed lens."""
     options = colmap.IncrementalPipelineOptions(
         num_threads=settings.threads,
         random_seed=seed,

@@ -1,1 +1,1 @@
-"""The forward model: how motion, shutter and exposure form a picture. Nobody keeps a second one."""
+"""The forward model: image formation by motion, shutter and exposure, shared by all but the simulator."""

@@ -49,7 +49,7 @@ class KernelField:
 
     @property
     def radius_px(self) -> int:
-        """Half size of an array that contains every kernel with its splatting margin."""
+        """Half size of an array that holds any of the kernels with its splatting margin."""
         reach_px = np.abs(self.paths_px).max(initial=0.0) + 3.5 * np.max(self.defocus_sigma_px, initial=0.0)
         return int(np.ceil(reach_px)) + 2
 
@@ -77,7 +77,7 @@ class KernelField:
         return replace(self, centres_px=centres_px, paths_px=paths_px, light=light, defocus_sigma_px=sigma_px)
 
     def scaled(self, scale: float) -> KernelField:
-        """The same blur in a picture that is ``scale`` times as large; the centres stay."""
+        """The same blur in a picture that is ``scale`` times as large; the centres are unchanged."""
         return replace(self, paths_px=self.paths_px * scale, defocus_sigma_px=self.defocus_sigma_px * scale)
 
 
@@ -90,7 +90,7 @@ def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inve
 
 
 def smooth_field(motion: RowMotion, anchor: float = 0.5) -> Callable[[Array], KernelField]:
-    """:func:`kernel_field` for any centres inside the picture, from paths computed once at the knots of splines.
+    """Like :func:`kernel_field` for any centres inside the picture, with paths interpolated by splines.
 
     With relief, paths change at depth edges, where splines would oscillate: each path is then computed.
     """

@@ -1,9 +1,9 @@
 """A neighbouring frame relative to a frame: where its pixels lie in the frame's picture, and their blur paths there.
 
 Both frames show one scene.  With f the frame's sharp picture, its rows at their anchors, a neighbour's pixel q also
-integrates f along a path: at each instant t of its row's exposure, what it sees lies at p(q, t) in the frame, by the
-one map of :mod:`warp` (forward_model, section 5).  So the neighbour's picture, warped to the frame's pixels, is a blur
-of the same f by other kernels.
+integrates f along a path: at each instant t of its row's exposure it sees the point at p(q, t) in the frame, by the map
+of :mod:`warp` (forward_model, section 5).  So the neighbour's picture, warped to the frame's pixels, is a blur of the
+same f by other kernels.
 """
 
 from __future__ import annotations

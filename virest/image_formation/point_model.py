@@ -57,7 +57,7 @@ class TrackTable:
     """All tracked points of all pairs in one table."""
 
     pair: Index
-    """(n,) number of the pair, rising from 0."""
+    """(n,) number of the pair, non-decreasing from 0."""
     window: Index
     """(n,) number of the pair's window."""
     first: Index

@@ -72,7 +72,7 @@ class FurtherTurn:
     """
 
     time_s: Array
-    """(n,) rising, IMU clock."""
+    """(n,) increasing, IMU clock."""
     rate_rad_s: Array
     """(n, 3) about the camera's axes at those instants."""
 

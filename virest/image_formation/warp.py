@@ -59,7 +59,7 @@ def moved_between(motion: CameraMotion, points_px: Array, from_s: Any, to_s: Any
 def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
     """p_g of eq 28: positions at the reference time of points of the recorded picture, (..., 2).
 
-    anchor: the fraction of its exposure that stands for each row; 0 its start (the paper), 0.5 its middle.
+    anchor: fraction of its exposure that represents each row; 0: its start (the paper), 0.5: its middle.
     """
     seen_s = motion.row_time_s(points_px, anchor)
     return moved_between(motion, points_px, seen_s, motion.reference_s, inverse_depth)

@@ -37,7 +37,7 @@ class MovingLens:
     """At stamp_0, with the stabiliser at rest."""
     focal_drift_per_s: float = 0.0
     shift_time_s: Array | None = None
-    """(m,) rising, IMU clock from stamp_0; None: no stabiliser."""
+    """(m,) increasing, IMU clock from stamp_0; None: no stabiliser."""
     shift: Array | None = None
     """(m, 2) at those times, units of the focal length, added before distortion; linear between, constant beyond."""
     path: tuple[Array, Array] | None = None

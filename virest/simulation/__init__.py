@@ -1,5 +1,5 @@
-"""Captures with known truth: the independent judge.
+"""Synthetic captures with known ground truth: an independent check on restoration.
 
-It shares no physics with the forward model that restoration inverts: row times, orientation, blur, lens inversion and
-the exposure curve are written here once more.
+The simulator shares no physics with the forward model that restoration inverts.  Row times, orientation, blur, lens
+inversion and the response curve are implemented here a second time.
 """

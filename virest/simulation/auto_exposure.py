@@ -1,10 +1,9 @@
-"""How the phone exposes each picture: exposure time, ISO, and how much light they let the picture have.
+"""Auto-exposure: exposure time, ISO and resulting brightness of each frame.
 
-As logged, light is exposure × ISO.  Without auto-exposure every picture gets the same: where the exposure changes, the
-ISO compensates for it.  With it the product moves, in one of two ways: a smooth walk, as when a phone follows a
-scene, or
-a staircase from dark to bright, as when somebody brackets one.  Exposure and ISO share the change half and half, as far
-as the frame's duration and the lowest ISO let them.
+Brightness is logged exposure × ISO.  Without auto-exposure it is constant: ISO compensates for changes of exposure
+time.  With auto-exposure it varies in one of two ways: a smooth walk, as when a phone adapts to a scene, or a staircase
+from dark to bright, as in exposure bracketing.  Exposure time and ISO each take half of the change in log units, within
+the limits set by the frame duration and the lowest ISO.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ NOMINAL_ISO = 144
 LOWEST_ISO = 50
 MAX_RANGE_EV = 12.0
 WALK_WAVES = 4
-"""Waves of 0.6, 1.2, 1.8 and 2.4 periods over the capture, ever weaker: no two frames in a row differ by much."""
+"""Cosines of 0.6, 1.2, 1.8 and 2.4 periods per capture, amplitude ∝ 1 / periods, so adjacent frames differ little."""
 
 
 @dataclass(frozen=True, slots=True)
 class AutoExposure:
-    """By how much exposure × ISO changes over a capture."""
+    """Variation of exposure × ISO over a capture."""
 
     range_ev: float
-    """From the darkest picture to the brightest; the nominal exposure lies in the middle."""
+    """From the darkest frame to the brightest, centred on the nominal exposure."""
     steps: int | None = None
-    """A staircase of exposures, dark to bright, each held equally long; None: a smooth walk."""
+    """Number of bracketed exposures, dark to bright, each held equally long; None: a smooth walk."""
 
     def __post_init__(self) -> None:
         if not 0 < self.range_ev <= MAX_RANGE_EV:
@@ -43,20 +42,23 @@ class AutoExposure:
 
 @dataclass(frozen=True, slots=True)
 class Exposures:
-    """Of every capture, by its number."""
+    """Exposure of each capture, indexed by capture number."""
 
     logged_s: Array
-    """(n,) exposure time that the log gives."""
+    """(n,) logged exposure time."""
     iso: NDArray[np.int64]
-    """(n,)."""
+    """(n,) logged ISO."""
     light: Array
-    """(n,) factor on the light against the nominal exposure; 1 without auto-exposure."""
+    """(n,) exposure × ISO relative to nominal; 1 without auto-exposure."""
 
 
 def plan_exposures(
     nominal_s: tuple[float, ...], auto: AutoExposure | None, count: int, fps: float, rng: np.random.Generator
 ) -> Exposures:
-    """Lay out the exposures of ``count`` captures; nominal_s: what they take in turn, at constant exposure × ISO."""
+    """Plan the exposures of ``count`` captures.
+
+    nominal_s: exposure times without auto-exposure, used cyclically at constant exposure × ISO.
+    """
     logged_s = np.array([nominal_s[k % len(nominal_s)] for k in range(count)])
     iso = np.array([round(NOMINAL_ISO * nominal_s[0] / s) for s in logged_s.tolist()], np.int64)
     if auto is None:
@@ -66,13 +68,13 @@ def plan_exposures(
     wanted = NOMINAL_ISO * nominal_s[0] * light
     longest_s = np.maximum(logged_s, 1 / fps)
     iso = np.maximum(iso, np.ceil(wanted / longest_s)).astype(np.int64)
-    # the light follows the whole ISO and nanoseconds that the log can hold, so the log says the truth
+    # brightness follows the rounded ISO and nanoseconds that the log stores, so the log is exact
     logged_s = np.rint(1e9 * wanted / iso) * 1e-9
     return Exposures(logged_s, iso, logged_s * iso / (NOMINAL_ISO * nominal_s[0]))
 
 
 def light_path_ev(auto: AutoExposure, count: int, rng: np.random.Generator) -> Array:
-    """(count,) log2 of the light, from −range_ev / 2 to range_ev / 2, both of which occur."""
+    """Log2 of the relative brightness (count,), spanning −range_ev / 2 to range_ev / 2."""
     if auto.steps is not None:
         step = np.arange(count) * auto.steps // count
         return auto.range_ev * (step / max(int(step[-1]), 1) - 0.5)

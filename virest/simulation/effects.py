@@ -1,7 +1,7 @@
-"""Hidden effects: what the true camera does and its nominal profile does not say (contract, section 4).
+"""Hidden effects: what the true camera does but its nominal profile omits (contract, section 4).
 
-An effect of the table is one line here: how its values change the profile, and what size they take when none is given.
-The simulator then renders with the true profile and writes the nominal one beside the movie.
+Each effect of the table has one entry here: how its values change the profile, and how they are drawn when none are
+given.  The simulator renders with the true profile and writes the nominal one beside the movie.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ STAMPS = ("exposure_start", "exposure_middle", "exposure_end")
 
 @dataclass(frozen=True, slots=True)
 class EffectContext:
-    """What a default size may depend on."""
+    """Inputs to the random default of an effect."""
 
     frames: int
     fps: float
@@ -37,45 +37,45 @@ class EffectContext:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """One named effect."""
+    """A named effect."""
 
     draw: Callable[[CameraProfile, EffectContext], list[Any]]
-    """Values when none are given."""
+    """Draws the values when none are given."""
     apply: Callable[[CameraProfile, list[Any]], CameraProfile]
-    """The nominal profile with the effect in it."""
+    """Returns the profile with the effect applied."""
     words: tuple[str, ...] = ()
-    """Allowed words, for an effect whose value is a word."""
-    spread: bool = False
-    """Whether one given number stands for the size of many values that are then drawn (gain_drift)."""
+    """Allowed values of an effect whose value is a word."""
+    per_frame: bool = False
+    """Whether the effect has one value per frame, drawn at a given RMS if VALUE is a single number (gain_drift)."""
     optional: int = 0
-    """How many of the last parameters may be left out of VALUE; they are drawn."""
-    endless: bool = False
-    """Whether infinity is a value (scene_depth: rotation only)."""
+    """Number of trailing parameters that VALUE may omit; omitted ones are drawn."""
+    allow_infinity: bool = False
+    """Whether infinity is a valid value (scene_depth: rotation only)."""
     parameters: tuple[str, ...] = ()
-    """Names of its numbers (or its one word), in the order in which VALUE lists them; of the table of effects."""
+    """Parameter names in the order of VALUE, from the table of effects."""
     strengths: tuple[str, ...] = ()
-    """Strengths of the phone's own processing that take the values, where no profile keeps them."""
+    """Fields of PhoneIsp that take the values, for an effect that no profile stores."""
 
 
 @dataclass(frozen=True, slots=True)
 class AppliedEffect:
-    """An effect with its values."""
+    """An effect and its values."""
 
     name: str
     parameters: dict[str, Any]
 
 
 def effect_names() -> tuple[str, ...]:
-    """All names that ``--effect`` knows."""
+    """Names that ``--effect`` accepts."""
     return tuple(EFFECTS)
 
 
 def hide_effects(
     nominal: CameraProfile, texts: list[str] | tuple[str, ...], context: EffectContext
 ) -> tuple[CameraProfile, tuple[AppliedEffect, ...]]:
-    """Make the true profile from a nominal one and effects as ``NAME`` or ``NAME=VALUE[,VALUE…]``.
+    """Apply effects, each ``NAME`` or ``NAME=VALUE[,VALUE…]``, to the nominal profile: true profile, applied effects.
 
-    Sizes of effects without VALUE are drawn from the context's rng.
+    Effects without VALUE draw theirs from ``context.rng``.
     """
     true, applied, seen = nominal, [], set()
     for text in texts:
@@ -89,14 +89,14 @@ def hide_effects(
         if equals:
             values = _parse_values(name, effect, value, values, context)
         true = effect.apply(true, values)
-        listed = effect.spread or len(effect.parameters) != len(values)
+        listed = effect.per_frame or len(effect.parameters) != len(values)
         shown = {effect.parameters[0]: values} if listed else dict(zip(effect.parameters, values, strict=True))
         applied.append(AppliedEffect(name, shown))
     return true, tuple(applied)
 
 
 def hidden_isp(applied: Sequence[AppliedEffect], isp: PhoneIsp = OFF) -> PhoneIsp:
-    """The phone's own processing with those effects in it that no profile keeps."""
+    """The phone's processing with the effects that no profile stores."""
     for one in applied:
         isp = replace(isp, **dict(zip(EFFECTS[one.name].strengths, one.parameters.values(), strict=False)))
     return isp
@@ -119,10 +119,10 @@ def _parse_values(name: str, effect: Effect, text: str, drawn: list[Any], contex
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
-        raise SettingsError(f"effect {name}: '{text}' is no number", hint="write NAME=0.1 or NAME=0.1,0.2") from None
-    if not all(math.isfinite(n) or (n == math.inf and effect.endless) for n in numbers):
-        raise SettingsError(f"effect {name}: '{text}' is no finite number", hint="write NAME=0.1 or NAME=0.1,0.2")
-    if effect.spread:
+        raise SettingsError(f"effect {name}: '{text}' is not a number", hint="write NAME=0.1 or NAME=0.1,0.2") from None
+    if not all(math.isfinite(n) or (n == math.inf and effect.allow_infinity) for n in numbers):
+        raise SettingsError(f"effect {name}: '{text}' is not a finite number", hint="write NAME=0.1 or NAME=0.1,0.2")
+    if effect.per_frame:
         if len(numbers) not in (1, context.frames):
             raise SettingsError(
                 f"effect {name} got {len(numbers)} factors for {context.frames} frames",
@@ -141,7 +141,7 @@ def _parse_values(name: str, effect: Effect, text: str, drawn: list[Any], contex
 
 
 def _signed(context: EffectContext, low: float, high: float) -> float:
-    """Draw a value of random sign whose size lies between low and high."""
+    """Draw a value of random sign and of magnitude between low and high."""
     return round(float(context.rng.uniform(low, high) * context.rng.choice((-1, 1))), 6)
 
 
@@ -179,7 +179,7 @@ def _scale_focal(profile: CameraProfile, values: list[float]) -> CameraProfile:
 
 
 def _stretch_pixels(profile: CameraProfile, values: list[float]) -> CameraProfile:
-    """fy is ``value`` times what square pixels would have; fx stays."""
+    """Multiply fy by the value; fx is unchanged."""
     lens = _lens(profile).intrinsics
     assert lens is not None
     return _lens(profile, fy_px=lens.fy_px * values[0])
@@ -192,7 +192,7 @@ def _shift_principal_point(profile: CameraProfile, values: list[float]) -> Camer
 
 
 def _bend_radially(profile: CameraProfile, values: list[float]) -> CameraProfile:
-    """``k1`` takes the value; it replaces no other distortion."""
+    """Set ``k1``; the other distortion coefficients are unchanged."""
     lens = _lens(profile).intrinsics
     assert lens is not None
     if lens.model == "none":
@@ -206,7 +206,7 @@ def _draw_frame_lag(_: CameraProfile, context: EffectContext) -> list[float]:
 
 
 def _gain_walk(context: EffectContext, rms: float) -> list[float]:
-    """Draw a smooth brightness drift of the given RMS in log light, median 1."""
+    """Draw one gain per frame: a smooth drift of the given RMS in log light, median 1."""
     if abs(rms) > 5:
         raise SettingsError(f"effect gain_drift: {rms:g} in log light is too much", hint="use about 0.1")
     k = np.arange(context.frames)
@@ -279,7 +279,9 @@ _BY_NAME: dict[str, Effect] = {
         lambda p, v: _extend(p, stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1]),
         optional=1,
     ),
-    "scene_depth": Effect(lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0]), endless=True),
+    "scene_depth": Effect(
+        lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0]), allow_infinity=True
+    ),
     "frame_lag": Effect(
         _draw_frame_lag,
         lambda p, v: _extend(p, frame_lag_s=v[0], frame_lag_frames=int(v[1])),
@@ -296,7 +298,7 @@ _BY_NAME: dict[str, Effect] = {
         lambda p, v: _extend(p, flicker_amplitude=v[0], flicker_frequency_hz=v[1], flicker_phase_rad=v[2]),
         optional=2,
     ),
-    "gain_drift": Effect(lambda p, c: _gain_walk(c, 0.12), _replace_gain, spread=True),
+    "gain_drift": Effect(lambda p, c: _gain_walk(c, 0.12), _replace_gain, per_frame=True),
     "defocus": Effect(lambda p, c: [_between(c, 1.0, 2.0)], lambda p, v: _extend(p, defocus_sigma_px=v[0])),
     "sharpening": Effect(
         lambda p, c: [_between(c, 0.7, 1.2), _between(c, 1.0, 1.8)],
@@ -307,10 +309,10 @@ _BY_NAME: dict[str, Effect] = {
 }
 
 _PARTS = {"gyro_bias": ("x", "y", "z"), "imu_rotation": ("x", "y", "z"), "principal_point": ("x", "y")}
-"""Vectors are given and noted part by part."""
+"""Component names of vector effects."""
 
 EFFECTS = {
     name: replace(_BY_NAME[name], parameters=_PARTS.get(name, tuple(one.name for one in effect.parameters)))
     for name, effect in TABLE.items()
 }
-"""All effects of the table."""
+"""All effects in the table, by name."""

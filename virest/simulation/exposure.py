@@ -1,10 +1,10 @@
-"""One exposure, brute force: many sharp instants, averaged row by row in linear light (forward_model, sections 1, 8).
+"""Brute-force exposure: sharp instants averaged row by row in linear light (forward_model, sections 1 and 8).
 
-A row (or column) that is read at fraction s of the readout gathers light during [t, t + exposure], t = t_frame + s ·
-readout.  The picture at each instant of a common grid is rendered only where rows are exposing just then; between
-two instants the light is taken as linear in time, which gives every row its own exact interval.
+A row (or column) read at fraction s of the readout gathers light during [t, t + exposure], t = t_frame + s · readout.
+At each instant of a common time grid only the rows being exposed are rendered.  Light is taken as linear in time
+between instants, so each row is integrated over its exact interval.
 
-Row order, lens and stabiliser are derived here, from the profile's numbers only.
+Row order, lens and stabiliser are derived here from the profile's numbers alone.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ Array = NDArray[np.float64]
 Image = NDArray[Any]
 
 STEP_PX = 0.4
-"""How far the picture may move between two instants."""
+"""Maximum image motion between two instants."""
 FINEST_STEP_PX = 0.1
-"""Exposures shorter than this motion are not divided any further."""
+"""An exposure spans at least four steps, unless they would be shorter than this motion."""
 _FILTER_STEP_S = 5e-4
-_SETTLED = 1e-12
-"""Error of a ray, x/z and y/z, below which Newton's steps find nothing but rounding."""
+_CONVERGED = 1e-12
+"""Residual in x/z and y/z at which Newton's method stops; below it lies rounding error."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Where a profile's pixels look, at any time."""
+    """Rays of a profile's pixels at any time."""
 
     profile: CameraProfile
     x: Image
@@ -44,16 +44,17 @@ class View:
     y: Image
     """y/z of each pixel's ray: (h, w), or (h, 1) without distortion."""
     x_rate: Image | None
-    """Change of x per unit of s, where the focal length is f / (1 − s); None where it stays."""
+    """Derivative of x with respect to s for a focal length f / (1 − s); None if the focal length is constant."""
     y_rate: Image | None
+    """The same for y."""
     filter_s: Array
-    """Times at which the stabiliser's angles are known; empty without stabiliser."""
+    """Times of the stabiliser angles; empty without a stabiliser."""
     filter_rad: Array
     """(n, 2) high-passed pitch and yaw, camera axes x and y."""
     hidden: Hidden = NOTHING
 
     def rays(self, time_s: float, rows: slice, columns: slice) -> tuple[Image, Image]:
-        """x/z and y/z of the rays of a part of the picture at one time; they broadcast against each other."""
+        """x/z and y/z of the rays of an image region at one time; the two arrays broadcast."""
         x, y = _part(self.x, rows, columns), _part(self.y, rows, columns)
         if self.x_rate is not None and self.y_rate is not None:
             y_px, x_px = np.ogrid[: self.profile.height, : self.profile.width]
@@ -71,7 +72,7 @@ class View:
 def make_view(
     profile: CameraProfile, motion: HandMotion, *, rest_s: float | None = None, hidden: Hidden = NOTHING
 ) -> View:
-    """Work out the rays of a profile's pixels and the path of its stabiliser along a motion, at rest at ``rest_s``."""
+    """Compute a profile's pixel rays and its stabiliser angles along a motion, the stabiliser at rest at ``rest_s``."""
     lens = _require_lens(profile)
     x, y = pixel_rays(lens)
     x_rate = y_rate = None
@@ -87,7 +88,7 @@ def make_view(
 
 
 def start_fractions(direction: str, width: int, height: int) -> Array:
-    """Fraction of the readout at which each row (or each column) starts, by its index in the stored picture."""
+    """Fraction of the readout at which each row (or column) starts, by its index in the stored frame."""
     count = height if direction in ("top_to_bottom", "bottom_to_top") else width
     order = np.arange(count)
     if direction in ("bottom_to_top", "right_to_left"):
@@ -96,9 +97,9 @@ def start_fractions(direction: str, width: int, height: int) -> Array:
 
 
 def expose(scene: Scene, motion: HandMotion, view: View, first_row_start_s: float, exposure_s: float) -> Image:
-    """Mean light at each pixel over its own row's exposure, with flicker: (h, w, 3), linear.
+    """Mean linear light at each pixel over its row's exposure, with flicker: (h, w, 3).
 
-    first_row_start_s: start of the first row's exposure; exposure_s: the true one; seconds as in the motion.
+    first_row_start_s: start of the first row's exposure on the clock of ``motion``.  exposure_s: true exposure time.
     """
     shutter = view.profile.shutter
     by_column = shutter.readout_direction in ("left_to_right", "right_to_left")
@@ -127,15 +128,15 @@ def expose(scene: Scene, motion: HandMotion, view: View, first_row_start_s: floa
 
 
 def instant(scene: Scene, motion: HandMotion, view: View, time_s: float) -> Image:
-    """Light of the whole picture at one time, as a global shutter would see it, without flicker: (h, w, 3)."""
+    """Light of the whole frame at one time, as seen by a global shutter, without flicker: (h, w, 3)."""
     homography = _homographies(scene, motion, np.array([time_s]))[0]
     return scene.sample(homography, *view.rays(time_s, slice(None), slice(None)))
 
 
 def hat_weights(instants_s: Array, start_s: Array, exposure_s: float) -> Array:
-    """Weights (instants, rows) of the mean over [start, start + exposure] of light that is linear between instants.
+    """Weights (instants, rows) that average light over [start, start + exposure], linear between instants.
 
-    instants_s: equally spaced, covering all exposures.  Each column sums to 1.
+    instants_s: equally spaced and covering all exposures.  Each column sums to 1.
     """
     step = instants_s[1] - instants_s[0]
     begin = (start_s[None, :] - instants_s[:, None]) / step
@@ -143,7 +144,7 @@ def hat_weights(instants_s: Array, start_s: Array, exposure_s: float) -> Array:
 
 
 def flicker(profile: CameraProfile, time_s: Array) -> Array:
-    """Factor on the light at each time."""
+    """Flicker factor on the light at each time."""
     ext = profile.extensions
     if not ext.flicker_amplitude:
         return np.ones(np.shape(time_s))
@@ -151,7 +152,7 @@ def flicker(profile: CameraProfile, time_s: Array) -> Array:
 
 
 def pixel_rays(lens: Intrinsics) -> tuple[Image, Image]:
-    """x/z and y/z of every pixel's ray; (1, w) and (h, 1) without distortion, else (h, w) each."""
+    """x/z and y/z of each pixel's ray: (1, w) and (h, 1) without distortion, else (h, w) each."""
     x = (np.arange(lens.width) - lens.cx_px) / lens.fx_px
     y = (np.arange(lens.height) - lens.cy_px) / lens.fy_px
     if lens.displaced is not None:
@@ -169,9 +170,9 @@ def pixel_rays(lens: Intrinsics) -> tuple[Image, Image]:
 
 
 def high_passed_angles(motion: HandMotion, cutoff_hz: float, rest_s: float) -> tuple[Array, Array]:
-    """Integrated rates about camera x and y through a first-order high-pass, at rest at rest_s: times, angles (n, 2).
+    """High-pass the integrated rates about camera x and y, at rest at ``rest_s``: times (n,), angles (n, 2).
 
-    ``θ' = ω − 2π cutoff θ``, stepped exactly for a rate that is linear within a step.
+    First-order filter ``θ' = ω − 2π cutoff θ``, solved exactly for a rate linear within each step.
     """
     time_s = np.arange(rest_s, motion.end_s, _FILTER_STEP_S)
     rate = motion.rate_rad_s(time_s)[:, :2]
@@ -196,12 +197,12 @@ def _require_lens(profile: CameraProfile) -> Intrinsics:
 
 
 def _part(plane: Image, rows: slice, columns: slice) -> Image:
-    """Cut a part of an array that may have a single row or column which stands for all."""
+    """Slice an array whose single row or column may be broadcast."""
     return plane[rows if plane.shape[0] > 1 else slice(None), columns if plane.shape[1] > 1 else slice(None)]
 
 
 def _instants(scene: Scene, motion: HandMotion, view: View, start_s: Array, exposure_s: float) -> Array:
-    """Equally spaced times over all rows' exposures, STEP_PX apart or closer in the picture."""
+    """Equally spaced times over all rows' exposures, at most STEP_PX of image motion apart."""
     begin, end = float(start_s.min()), float(start_s.max()) + exposure_s
     fastest = max(_picture_speed(scene, motion, view, begin, end), 1e-6)
     step = min(STEP_PX / fastest, max(exposure_s / 4, FINEST_STEP_PX / fastest), end - begin)
@@ -211,7 +212,7 @@ def _instants(scene: Scene, motion: HandMotion, view: View, start_s: Array, expo
 
 
 def _picture_speed(scene: Scene, motion: HandMotion, view: View, begin: float, end: float) -> float:
-    """Greatest speed of the picture, px/s, at its centre and half way to its corners."""
+    """Maximum image speed, px/s: pitch and yaw at the centre, roll half way to a corner, sway and scene motion."""
     lens = _require_lens(view.profile)
     times = np.linspace(begin, end, 9)
     rate = motion.rate_rad_s(times)
@@ -234,7 +235,7 @@ def _hat_integral(u: Array) -> Array:
 
 
 def _focal_rate(lens: Intrinsics) -> tuple[Image, Image]:
-    """Change of x/z and y/z per unit of shrinking s, where the focal length is f / (1 − s): (h, w) each."""
+    """Derivatives of x/z and y/z with respect to s for a focal length f / (1 − s): (h, w) each."""
     small = 1e-3
     before, after = (
         [np.broadcast_to(a, (lens.height, lens.width)).astype(np.float64) for a in pixel_rays(shrunk)]
@@ -245,7 +246,7 @@ def _focal_rate(lens: Intrinsics) -> tuple[Image, Image]:
 
 
 def _undo_radtan(x: Array, y: Array, lens: Intrinsics) -> tuple[Array, Array]:
-    """Invert Brown's distortion by Newton's method with a numerical Jacobian."""
+    """Invert Brown–Conrady distortion by Newton's method with a numerical Jacobian."""
     k1, k2, p1, p2, k3 = lens.coefficients
 
     def distort(u: Array, v: Array) -> tuple[Array, Array]:
@@ -256,7 +257,7 @@ def _undo_radtan(x: Array, y: Array, lens: Intrinsics) -> tuple[Array, Array]:
     u, v, small = x.copy(), y.copy(), 1e-6
     for _ in range(8):
         fu, fv = distort(u, v)
-        if max(np.abs(fu - x).max(), np.abs(fv - y).max()) < _SETTLED:
+        if max(np.abs(fu - x).max(), np.abs(fv - y).max()) < _CONVERGED:
             break
         gu, gv = distort(u + small, v)
         hu, hv = distort(u, v + small)
@@ -268,7 +269,7 @@ def _undo_radtan(x: Array, y: Array, lens: Intrinsics) -> tuple[Array, Array]:
 
 
 def _undo_fisheye(x: Array, y: Array, coefficients: tuple[float, ...]) -> tuple[Array, Array]:
-    """Invert Kannala and Brandt's polynomial by a fine table of angles."""
+    """Invert the Kannala–Brandt polynomial by interpolation in a fine table of angles."""
     theta = np.linspace(0, 1.5, 30_001)
     bent = theta + sum(k * theta ** (3 + 2 * i) for i, k in enumerate(coefficients))
     rising = int(np.argmax(np.diff(bent) <= 0)) or len(bent)

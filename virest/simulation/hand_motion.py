@@ -1,11 +1,11 @@
-"""How the hand moves: angular rate and sway as sums of sinusoids, orientation integrated from them.
+"""Hand motion: angular rate and sway as sums of sinusoids, and the orientation integrated from the rate.
 
-The rate of the camera, in its own axes, is ``ω(t) = Σ a cos(2π f t + φ)`` per axis, so it and its derivative are known
-in closed form.  Orientation follows ``R' = R [ω]`` and is integrated by the fourth-order Magnus method (two Gauss
-nodes a step; Iserles & Nørsett 1999, doi:10.1098/rsta.1999.0362), from the nearest node to any time that is asked for.
+The rate in camera axes is ``ω(t) = Σ a cos(2π f t + φ)`` per axis, so it and its derivatives are known in closed form.
+Orientation obeys ``R' = R [ω]×``.  The fourth-order Magnus method (two Gauss nodes per step; Iserles & Nørsett 1999,
+doi:10.1098/rsta.1999.0362) integrates it on a fixed grid, and from the nearest grid node to any requested time.
 
-World axes: those of the camera at its mean pose, x right, y down, z forward.  Times are seconds on the IMU's clock,
-counted from the first stamp.
+World axes are those of the camera at its mean pose: x right, y down, z forward.  Times are seconds on the IMU clock
+from the first stamp.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ Array = NDArray[np.float64]
 
 NODE_STEP_S = 5e-4
 SHARE_PER_AXIS = (0.64, 0.64, 0.42)
-"""Of the RMS rate, on pitch, yaw and roll: hands roll less than they nod and turn."""
+"""Fraction of the RMS rate on pitch, yaw and roll: hands roll less than they pitch and yaw."""
 _GAUSS = 0.5 - np.sqrt(3.0) / 6.0
 _COMPONENTS = 18
 
 
 class Signal(Protocol):
-    """A vector that is known at every time."""
+    """A vector-valued function of time."""
 
     def at(self, time_s: Array, derivative: int = 0) -> Array:
-        """Value, or a time derivative of it, at times (...,): (..., 3)."""
+        """Value, or its time derivative of the given order, at times (...,): (..., 3)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Waves:
-    """A vector-valued sum of cosines, ``Σ amplitude cos(2π frequency t + phase)`` on each of three axes."""
+    """Sum of cosines ``Σ amplitude cos(2π frequency t + phase)`` on each of three axes."""
 
     frequency_hz: Array
     """(3, n)."""
@@ -46,37 +46,37 @@ class Waves:
     """(3, n)."""
 
     def at(self, time_s: Array, derivative: int = 0) -> Array:
-        """Sum, or its time derivative of the given order at times (...,): (..., 3)."""
+        """Sum, or its time derivative of the given order, at times (...,): (..., 3)."""
         omega = 2 * np.pi * self.frequency_hz
         angle = np.asarray(time_s, float)[..., None, None] * omega + self.phase_rad + derivative * np.pi / 2
         return np.sum(self.amplitude * omega**derivative * np.cos(angle), axis=-1)
 
     def scaled(self, factor: float) -> Waves:
-        """Return the same motion, ``factor`` times as large."""
+        """Return the waves with amplitudes multiplied by ``factor``."""
         return Waves(self.frequency_hz, self.amplitude * factor, self.phase_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class HandMotion:
-    """A camera's motion, known at every time of [start_s, end_s] (and, more slowly integrated, a little beyond)."""
+    """Motion of a camera over [start_s, end_s]; orientation a little beyond is one coarse step from the end node."""
 
     rate: Signal
     """Angular rate, rad/s, camera axes."""
     sway: Signal
-    """Position of the camera's centre, metres, world axes."""
+    """Position of the camera centre, metres, world axes."""
     node_s: Array
     """(n,) times of the integrated orientations."""
     node_quat: Array
-    """(n, 4) world from camera at node_s, w x y z."""
+    """(n, 4) orientations, world from camera, w x y z."""
 
     @property
     def start_s(self) -> float:
-        """First time with an integrated orientation."""
+        """Time of the first integrated orientation."""
         return float(self.node_s[0])
 
     @property
     def end_s(self) -> float:
-        """Last time with an integrated orientation."""
+        """Time of the last integrated orientation."""
         return float(self.node_s[-1])
 
     def rate_rad_s(self, time_s: Array) -> Array:
@@ -84,7 +84,7 @@ class HandMotion:
         return self.rate.at(time_s)
 
     def rotation(self, time_s: Array) -> Rotation:
-        """World from camera at times (n,)."""
+        """Orientation, world from camera, at times (n,)."""
         time_s = np.atleast_1d(np.asarray(time_s, float))
         nearest = np.clip(np.round((time_s - self.node_s[0]) / NODE_STEP_S).astype(int), 0, len(self.node_s) - 1)
         step = time_s - self.node_s[nearest]
@@ -92,7 +92,7 @@ class HandMotion:
         return start * Rotation.from_rotvec(_magnus(self.rate, self.node_s[nearest], step))
 
     def quat_world_cam(self, time_s: Array) -> Array:
-        """World from camera at times (n,), w x y z, scalar part not negative: (n, 4)."""
+        """Orientation, world from camera, at times (n,), w x y z with w ≥ 0: (n, 4)."""
         return self.rotation(time_s).as_quat(canonical=True, scalar_first=True)
 
     def position_m(self, time_s: Array) -> Array:
@@ -100,9 +100,9 @@ class HandMotion:
         return self.sway.at(time_s)
 
     def specific_force_m_s2(self, time_s: Array, arm_cam_m: Array, gravity_world_m_s2: Array) -> Array:
-        """Specific force on an accelerometer at ``arm_cam_m`` in camera axes, in camera axes, at times (n,): (n, 3).
+        """Specific force, camera axes, at times (n,) on an accelerometer at ``arm_cam_m`` (camera axes): (n, 3).
 
-        ``f = Rᵀ (p'' − g) + ω' × r + ω × (ω × r)``; at rest −g, so +9.8 upwards.
+        ``f = Rᵀ (p'' − g) + ω' × r + ω × (ω × r)``; at rest it is −g, 9.8 m/s² upwards.
         """
         omega, omega_dot = self.rate.at(time_s), self.rate.at(time_s, 1)
         inertial = self.sway.at(time_s, 2) - gravity_world_m_s2
@@ -122,12 +122,12 @@ def random_hand_motion(
     margin_s: float = 1.0,
     band_hz: tuple[float, float] = (0.5, 12.0),
 ) -> HandMotion:
-    """Hand tremor whose rate has the given RMS (of the vector's length) over [0, duration_s].
+    """Hand tremor whose rate vector has the given RMS magnitude over [0, duration_s].
 
-    The rate's spectrum rises to about 2 Hz, is flat, and falls above 8 Hz.  Orientations cover ``margin_s`` more on
-    both sides.  ``sway_rms_m`` adds a translation between 0.3 and 2.5 Hz of that RMS length, ``walk_m`` a step along an
-    arc: so far from side to side, and so far out and back along y and z.  ``pan_rad_s`` adds a steady turn about the
-    camera's y axis.
+    The rate spectrum rises to about 2 Hz, is flat, and falls above 8 Hz.  Orientations extend ``margin_s`` beyond both
+    ends.  sway_rms_m: RMS magnitude of a translation between 0.3 and 2.5 Hz.  walk_m: a step along an arc, side to side
+    along x by the first value, out and back along y and z by the others.  pan_rad_s: constant rate about the camera's
+    y axis.
     """
     rate = _random_waves(rng, band_hz, lambda f: (f / 2) / (1 + f / 2) / (1 + (f / 8) ** 2))
     rate = _with_rms(rate, np.array(SHARE_PER_AXIS) * rate_rms_rad_s, duration_s)
@@ -145,18 +145,18 @@ def constant_motion(
     *,
     start_s: float = -1.0,
     end_s: float = 1.0,
-    velocity_free_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> HandMotion:
-    """Turn at a constant rate in camera axes at a constant position; the world's axes are the camera's at time 0."""
+    """Rotate at a constant rate (camera axes) and fixed position; world axes are the camera's at time 0."""
     rate = Waves(np.zeros((3, 1)), np.array(rate_rad_s, float)[:, None], np.zeros((3, 1)))
-    sway = Waves(np.zeros((3, 1)), np.array(velocity_free_position_m, float)[:, None], np.zeros((3, 1)))
+    sway = Waves(np.zeros((3, 1)), np.array(position_m, float)[:, None], np.zeros((3, 1)))
     return integrate_motion(rate, sway, start_s, end_s, centre_on_s=(0.0, 0.0))
 
 
 def integrate_motion(
     rate: Signal, sway: Signal, start_s: float, end_s: float, *, centre_on_s: tuple[float, float]
 ) -> HandMotion:
-    """Orientation at nodes over [start_s, end_s]; the mean orientation over ``centre_on_s`` is the world's axes."""
+    """Integrate orientation over [start_s, end_s]; world axes are the mean orientation over ``centre_on_s``."""
     count = int(np.ceil((end_s - start_s) / NODE_STEP_S)) + 1
     node_s: Array = start_s + NODE_STEP_S * np.arange(count, dtype=float)
     steps = Rotation.from_rotvec(_magnus(rate, node_s[:-1], np.full(count - 1, NODE_STEP_S, float)))
@@ -169,7 +169,7 @@ def integrate_motion(
 
 
 def _magnus(rate: Signal, start_s: Array, step_s: Array) -> Array:
-    """Rotation vectors of steps (n,) that begin at start_s (n,), in the axes at the start: (n, 3); O(step⁵)."""
+    """Rotation vectors (n, 3) of steps (n,) from start_s (n,), in the axes at the step's start; error O(step⁵)."""
     first = rate.at(start_s + _GAUSS * step_s)
     second = rate.at(start_s + (1 - _GAUSS) * step_s)
     step = step_s[:, None]
@@ -177,7 +177,7 @@ def _magnus(rate: Signal, start_s: Array, step_s: Array) -> Array:
 
 
 def _running_product(steps: Array) -> Array:
-    """Products q0 = 1, q1 = s0, q2 = s0 s1, … of quaternions (n, 4): (n + 1, 4)."""
+    """Running products q0 = 1, q1 = s0, q2 = s0 s1, … of quaternions (n, 4): (n + 1, 4)."""
     result = np.empty((len(steps) + 1, 4))
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
     result[0] = w, x, y, z
@@ -193,16 +193,16 @@ def _running_product(steps: Array) -> Array:
 
 
 def _random_waves(rng: np.random.Generator, band_hz: tuple[float, float], spectrum: Callable[[Array], Array]) -> Waves:
-    """One component in each of equal steps of log frequency, with random phase and a little random amplitude."""
+    """One component per equal interval of log frequency, with random phase and an amplitude within ±40 %."""
     low, high = np.log(band_hz)
-    place = (np.arange(_COMPONENTS) + rng.uniform(size=(3, _COMPONENTS))) / _COMPONENTS
-    frequency = np.exp(low + (high - low) * place)
+    fraction = (np.arange(_COMPONENTS) + rng.uniform(size=(3, _COMPONENTS))) / _COMPONENTS
+    frequency = np.exp(low + (high - low) * fraction)
     amplitude = spectrum(frequency) * rng.uniform(0.6, 1.4, (3, _COMPONENTS))
     return Waves(frequency, amplitude, rng.uniform(0, 2 * np.pi, (3, _COMPONENTS)))
 
 
 def _with_arc(waves: Waves, walk_m: tuple[float, float, float], duration_s: float) -> Waves:
-    """Half a turn of an ellipse over [0, duration_s] on top: x from +walk/2 to −walk/2, y and z out and back."""
+    """Add half an ellipse over [0, duration_s]: x from +walk/2 to −walk/2, y and z out by walk and back."""
     frequency = np.full((3, 1), 0.5 / duration_s)
     amplitude = np.array([[0.5 * walk_m[0]], [walk_m[1]], [walk_m[2]]])
     phase = np.array([[0.0], [-np.pi / 2], [-np.pi / 2]])
@@ -211,14 +211,14 @@ def _with_arc(waves: Waves, walk_m: tuple[float, float, float], duration_s: floa
 
 
 def _with_constant(waves: Waves, value: tuple[float, float, float]) -> Waves:
-    """The waves and a constant, as a wave of frequency 0."""
+    """Add a constant, as a wave of frequency 0."""
     zero = np.zeros((3, 1))
     parts = ((waves.frequency_hz, zero), (waves.amplitude, np.array(value)[:, None]), (waves.phase_rad, zero))
     return Waves(*(np.concatenate(pair, axis=1) for pair in parts))
 
 
 def _with_rms(waves: Waves, rms_per_axis: Array, duration_s: float) -> Waves:
-    """Each axis scaled to its RMS over [0, duration_s]."""
+    """Scale each axis to its RMS over [0, duration_s]."""
     sampled = waves.at(np.linspace(0.0, max(duration_s, 0.05), 2000))
     now = np.sqrt(np.mean(sampled**2, axis=0))
     return Waves(waves.frequency_hz, waves.amplitude * (rms_per_axis / now)[:, None], waves.phase_rad)

@@ -1,10 +1,9 @@
-"""What a phone does to its pictures and its gyroscope's samples, and no camera profile says: the strengths.
+"""Settings of a phone's own processing of frames and gyroscope samples, which no camera profile describes.
 
-Each strength is off by default.  The pictures take them in the order of a phone's pipeline (Hasinoff et al. 2016,
-"Burst photography for high dynamic range and low-light imaging on mobile cameras", doi:10.1145/2980179.2980254,
-section 6): highlights roll off before the sensor's curve; then noise; then denoising over time and over space, the
-global tone curve, local tone mapping, sharpening; then the encoder.  :mod:`phone_pictures` and :mod:`phone_gyro` do
-the work.
+Every step is off by default.  Frames pass through the steps in the order of a phone's pipeline (Hasinoff et al. 2016,
+"Burst photography for high dynamic range and low-light imaging on mobile cameras", doi:10.1145/2980179.2980254, section
+6): highlight roll-off before the response curve; noise; temporal and spatial denoising; global tone curve; local tone
+mapping; sharpening; encoder.  :mod:`phone_pictures` and :mod:`phone_gyro` implement them.
 """
 
 from __future__ import annotations
@@ -39,33 +38,33 @@ class PhoneIsp:
     """Strengths of a phone's own processing; 0 (or None) is off."""
 
     tone: float = 0.0
-    """Share of an S-shaped curve in the global tone curve, 0 to 1, on top of the profile's response."""
+    """Weight of an S-shaped curve in the global tone curve, 0 to 1, on top of the profile's response."""
     local_tone: float = 0.0
-    """Compression of the coarse brightness, 0 to 0.9: bases that differ by 2 stops then differ by 2 (1 − strength)."""
+    """Compression of the low-frequency brightness, 0 to 0.9: 2 stops become 2 (1 − strength) stops."""
     highlights: float = 0.0
-    """Top share of the light's range, 0 to 0.9, in which highlights roll off towards white instead of clipping."""
+    """Fraction of the light range, at its top, in which highlights roll off instead of clipping, 0 to 0.9."""
     denoise: float = 0.0
-    """Spatial denoising of the luma: range of the bilateral filter in standard deviations of the noise; chroma, 2×."""
+    """Spatial denoising: range sigma of the luma's bilateral filter in noise standard deviations; chroma takes 2×."""
     temporal_denoise: float = 0.0
-    """Share of the previous output, 0 to 0.95, where nothing moves."""
+    """Weight of the previous output in static regions, 0 to 0.95."""
     sharpen: float = 0.0
     """Amount of the unsharp mask, 0 to 5."""
     sharpen_radius_px: float = 1.0
     """Standard deviation of the unsharp mask's Gaussian."""
     gyro_noise: float = 0.0
-    """Noise density of the gyroscope in rad/s/√Hz, in place of the recorder's usual noise."""
+    """Gyroscope noise density, rad/s/√Hz; replaces SessionSettings.gyro_noise_rad_s."""
     gyro_jitter_s: float = 0.0
-    """Standard deviation of the inertial samples' time stamps."""
+    """Standard deviation of the timestamp jitter of inertial samples."""
     gyro_lowpass_hz: float = 0.0
-    """Corner of a second-order low pass on the rates."""
+    """Corner of a second-order low-pass filter on the rates."""
     stabiliser_rest: float = 0.0
-    """Fraction of the fast pitch and yaw that a stabiliser takes and the profile does not know of, 0 to 1."""
+    """Fraction of fast pitch and yaw removed by a stabiliser that the nominal profile omits, 0 to 1."""
     stabiliser_cutoff_hz: float = 1.0
-    """Cutoff of that stabiliser's high-pass."""
+    """High-pass cutoff of that stabiliser."""
     offset_s: float = 0.0
-    """Time offset, inertial clock less camera clock, beyond the profile's."""
+    """Time offset added to the profile's, inertial clock − camera clock."""
     bits_per_px: float | None = None
-    """Of the encoder, per pixel and frame; None: the recorder's."""
+    """Encoder bit rate per pixel and frame; None: the recorder's default."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _LIMITS.items():
@@ -75,11 +74,11 @@ class PhoneIsp:
 
     @property
     def develops(self) -> bool:
-        """Whether anything happens between the noise and the encoder."""
+        """Whether any step between noise and encoder is on."""
         return any((self.tone, self.local_tone, self.denoise, self.temporal_denoise, self.sharpen))
 
     def true_profile(self, profile: CameraProfile) -> CameraProfile:
-        """The camera with the offset and the stabiliser that its nominal profile does not know of."""
+        """Add the time offset and stabiliser that the nominal profile omits."""
         if self.offset_s:
             profile = replace(profile, time_offset_s=(profile.time_offset_s or 0.0) + self.offset_s)
         if not self.stabiliser_rest:
@@ -95,7 +94,7 @@ class PhoneIsp:
         return replace(profile, extensions=extensions)
 
     def in_force(self) -> dict[str, float]:
-        """The strengths that are on, with what belongs to them."""
+        """The strengths that are on, with their dependent settings."""
         on = {name: value for name, value in asdict(self).items() if name not in _BELONGS_TO and value}
         return on | {name: getattr(self, name) for name, to in _BELONGS_TO.items() if to in on}
 
@@ -119,11 +118,11 @@ ISPS: dict[str, PhoneIsp] = {
         bits_per_px=0.3,
     ),
 }
-"""Named sets.  ``phone``: 0.01 rad/s of noise at 200 samples/s, a stabiliser calibrated to a tenth, clocks to 2 ms."""
+"""Named presets.  ``phone``: 0.01 rad/s noise at 200 Hz, a 10 % stabiliser error, a 2 ms clock error."""
 
 
 def make_isp(name: str | None, **strengths: float | None) -> PhoneIsp:
-    """A named set, with the strengths that are given in place of its own."""
+    """A preset, with any given strengths overriding its own."""
     if name is not None and name not in ISPS:
         raise SettingsError(f"phone's processing '{name}' is not known", hint=f"use one of {', '.join(ISPS)}")
     known = {field.name for field in fields(PhoneIsp)}

@@ -1,7 +1,7 @@
-"""A phone's pipeline from the sensor's noisy grey to the 8-bit picture that its encoder gets.
+"""A phone's image pipeline from noisy sensor grey levels to the encoder's input, before 8-bit rounding.
 
-Pictures are (h, w, 3) float32 RGB, grey in [0, 1] behind the sensor's curve; the strengths are those of
-:class:`~virest.simulation.phone_isp.PhoneIsp`.  Luma and chroma are those of BT.601.
+Images are (h, w, 3) float32 RGB, grey in [0, 1] after the response curve.  Strengths are those of
+:class:`~virest.simulation.phone_isp.PhoneIsp`.  Luma and chroma follow BT.601.
 """
 
 from __future__ import annotations
@@ -17,37 +17,38 @@ from virest.simulation.phone_isp import PhoneIsp
 Image = NDArray[Any]
 
 SPACE_SIGMA_PX, SPACE_WINDOW_PX = 2.0, 9
-"""Spatial Gaussian of the bilateral filter, and its window."""
+"""Spatial sigma of the bilateral filter, and its window width."""
 CHROMA_RADIUS_PX = 4
 CHROMA_TIMES_LUMA = 2.0
 MOTION_BOX_PX = 5
-"""Differences in time are judged by their mean over this box."""
+"""Width of the box over which frame differences are averaged for motion detection."""
 STILL_SIGMAS = 3.0
-"""A mean difference of this many standard deviations of its noise is motion: half of the history is dropped."""
+"""Mean frame difference, in noise standard deviations, at which motion halves the weight of the previous frame."""
 BASE_OF_LONG_SIDE = 1 / 16
-"""Radius of the coarse brightness."""
+"""Radius of the guided filter for the base layer, as a fraction of the long side."""
 BASE_REDUCTION = 4
+"""Downsampling factor of the base layer."""
 BASE_EDGE = 0.1
-"""Contrast, in grey, of the edges that the coarse brightness keeps."""
+"""Grey-level contrast above which the base layer preserves an edge."""
 MIDDLE_GREY, DARKEST = 0.46, 0.02
 
 
 class PhonePictures:
-    """One phone's pipeline; the temporal filter remembers the picture before, so pictures come in their order."""
+    """A phone's pipeline; frames must come in order, since the temporal filter keeps the previous one."""
 
     def __init__(self, isp: PhoneIsp, noise: float) -> None:
-        """noise: standard deviation of the sensor's noise, grey of 1."""
+        """noise: standard deviation of the sensor noise, white = 1."""
         self._isp, self._noise = isp, noise
-        self._before: Image | None = None
+        self._previous: Image | None = None
 
     def develop(self, grey: Image) -> Image:
-        """Denoise, map the tones, sharpen: grey in [0, 1], not yet rounded."""
+        """Denoise, tone-map and sharpen: grey in [0, 1], not yet rounded."""
         isp = self._isp
         picture = np.clip(grey, 0.0, 1.0).astype(np.float32)
         if isp.temporal_denoise and self._noise:
-            if self._before is not None:
-                picture = denoise_in_time(picture, self._before, isp.temporal_denoise, self._noise)
-            self._before = picture
+            if self._previous is not None:
+                picture = denoise_in_time(picture, self._previous, isp.temporal_denoise, self._noise)
+            self._previous = picture
         if isp.denoise and self._noise:
             picture = denoise_in_space(picture, isp.denoise * self._noise)
         picture = tone_curve(picture, isp.tone)
@@ -59,10 +60,10 @@ class PhonePictures:
 
 
 def roll_off_highlights(light: Image, share: float) -> Image:
-    """Light that bends towards 1 in the top ``share`` of its range: ``k + s (1 − exp(−(l − k)/s))`` above k = 1 − s.
+    """Compress the top ``share`` s of the light range towards 1: ``k + s (1 − exp(−(l − k)/s))`` above k = 1 − s.
 
-    A film's shoulder, smooth at the knee; light of any height stays below white (Reinhard et al. 2002, "Photographic
-    tone reproduction for digital images", doi:10.1145/566654.566575, in its exponential form).
+    A film-like shoulder with a continuous slope at the knee; all light maps below white (Reinhard et al. 2002,
+    "Photographic tone reproduction for digital images", doi:10.1145/566654.566575, in its exponential form).
     """
     if not share:
         return light
@@ -72,9 +73,9 @@ def roll_off_highlights(light: Image, share: float) -> Image:
 
 
 def tone_curve(grey: Image, strength: float) -> Image:
-    """``(1 − s) g + s g² (3 − 2 g)``: contrast up in the middle, down at both ends, black and white kept.
+    """``(1 − s) g + s g² (3 − 2 g)``: more contrast in the mid-tones, less at both ends, black and white fixed.
 
-    The S-shaped global curve of camera pipelines (Hasinoff et al. 2016, section 6, step 9; sigmoids as in Braun &
+    The S-shaped global tone curve of camera pipelines (Hasinoff et al. 2016, section 6, step 9; sigmoids as in Braun &
     Fairchild 1999, doi:10.1117/1.482706).
     """
     if not strength:
@@ -84,10 +85,11 @@ def tone_curve(grey: Image, strength: float) -> Image:
 
 
 def map_local_tones(grey: Image, strength: float) -> Image:
-    """Compress the coarse brightness b about middle grey and keep what is fine: grey × (b / middle)^−strength.
+    """Compress the base layer b about middle grey and keep the detail: grey × (b / middle)^−strength.
 
-    Base and detail after Durand & Dorsey 2002 (doi:10.1145/566654.566574), the base by a guided filter, which keeps
-    edges (He, Sun & Tang 2013, doi:10.1109/TPAMI.2012.213), at a quarter of the size (He & Sun 2015, arXiv:1505.00996).
+    Base and detail after Durand & Dorsey 2002 (doi:10.1145/566654.566574).  The base comes from an edge-preserving
+    guided filter (He, Sun & Tang 2013, doi:10.1109/TPAMI.2012.213) at a quarter of the resolution (He & Sun 2015,
+    arXiv:1505.00996).
     """
     luma = cv2.transform(grey, _TO_YCC)[..., 0]
     height, width = luma.shape
@@ -101,10 +103,10 @@ def map_local_tones(grey: Image, strength: float) -> Image:
 
 
 def denoise_in_space(grey: Image, range_sigma: float) -> Image:
-    """Luma: a bilateral filter (Tomasi & Manduchi 1998, doi:10.1109/ICCV.1998.710815); chroma: guided by that luma.
+    """Bilateral filter on luma (Tomasi & Manduchi 1998, doi:10.1109/ICCV.1998.710815), guided filter on chroma.
 
-    range_sigma: differences of luma well below it are averaged away, well above it kept; chroma takes twice as much,
-    for the eye sees its detail less (Hasinoff et al. 2016, section 6, step 7).
+    range_sigma: luma differences well below it are averaged, those well above it kept.  Chroma, guided by the filtered
+    luma, takes twice the value, since the eye resolves less detail in it (Hasinoff et al. 2016, section 6, step 7).
     """
     parts = cv2.split(cv2.transform(grey, _TO_YCC))
     luma = cv2.bilateralFilter(parts[0], SPACE_WINDOW_PX, range_sigma, SPACE_SIGMA_PX, borderType=cv2.BORDER_REFLECT)
@@ -115,24 +117,25 @@ def denoise_in_space(grey: Image, range_sigma: float) -> Image:
     return cv2.transform(cv2.merge(planes), _FROM_YCC)
 
 
-def denoise_in_time(grey: Image, before: Image, share: float, noise: float) -> Image:
-    """Recursive and motion-adaptive: ``x + w (y_before − x)``, w = share where nothing moves, 0 where something does.
+def denoise_in_time(grey: Image, previous: Image, share: float, noise: float) -> Image:
+    """Motion-adaptive recursive filter ``x + w (y_previous − x)``: w = share in static regions, → 0 with motion.
 
-    Motion is the mean difference of luma over a box against its noise (the switched recursive filter of television;
-    Brailean et al. 1995, "Noise reduction filters for dynamic image sequences: a review", doi:10.1109/5.406412).
+    Motion is judged by the mean luma difference over a box relative to its noise (the switched recursive filter of
+    television; Brailean et al. 1995, "Noise reduction filters for dynamic image sequences: a review",
+    doi:10.1109/5.406412).
     """
-    difference = cv2.transform(grey - before, _TO_YCC)[..., 0]
+    difference = cv2.transform(grey - previous, _TO_YCC)[..., 0]
     mean = np.abs(cv2.blur(difference, (MOTION_BOX_PX, MOTION_BOX_PX), borderType=cv2.BORDER_REFLECT))
-    still_px = noise * np.linalg.norm(_TO_YCC[0]) * np.sqrt(1 + (1 - share) / (1 + share)) / MOTION_BOX_PX
-    keep = share * np.exp2(-((mean / (STILL_SIGMAS * still_px)) ** 2))
-    return grey + keep[..., None].astype(np.float32) * (before - grey)
+    mean_noise = noise * np.linalg.norm(_TO_YCC[0]) * np.sqrt(1 + (1 - share) / (1 + share)) / MOTION_BOX_PX
+    weight = share * np.exp2(-((mean / (STILL_SIGMAS * mean_noise)) ** 2))
+    return grey + weight[..., None].astype(np.float32) * (previous - grey)
 
 
 def sharpen(grey: Image, amount: float, radius_px: float) -> Image:
-    """Unsharp mask on the luma: ``y + amount (y − G ∗ y)``, the same change on all three channels.
+    """Unsharp mask on luma, ``y + amount (y − G ∗ y)``, with the same change added to all three channels.
 
-    Overshoot beside an edge is in proportion to it (Polesel, Ramponi & Mathews 2000, doi:10.1109/83.826787, the linear
-    form); phones sum several Gaussians (Hasinoff et al. 2016, section 6, step 11), of which this is one.
+    Overshoot is proportional to the edge (linear form of Polesel, Ramponi & Mathews 2000, doi:10.1109/83.826787).
+    Phones sum several Gaussians (Hasinoff et al. 2016, section 6, step 11); this uses one.
     """
     luma = cv2.transform(grey, _TO_YCC)[..., 0]
     soft = cv2.GaussianBlur(luma, (0, 0), radius_px, borderType=cv2.BORDER_REFLECT)
@@ -147,7 +150,7 @@ _FROM_YCC = np.linalg.inv(_TO_YCC.astype(np.float64)).astype(np.float32)
 
 
 def _guided(guide: Image, plane: Image, radius_px: int, eps: float) -> tuple[Image, Image]:
-    """Guided filter's coefficients: plane ≈ slope · guide + level near each pixel, slopes held down by eps."""
+    """Guided-filter coefficients: plane ≈ slope · guide + level around each pixel, slopes regularised by eps."""
 
     def mean(values: Image) -> Image:
         return cv2.blur(values, (2 * radius_px + 1,) * 2, borderType=cv2.BORDER_REFLECT)

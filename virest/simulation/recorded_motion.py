@@ -1,8 +1,8 @@
-"""A motion that a phone recorded, for the simulator: its gyroscope's samples instead of a random hand.
+"""Camera motion from a phone's recorded gyroscope samples, in place of random hand motion.
 
-Between samples the rate follows modified Akima polynomials (Akima 1970, doi:10.1145/321607.321609): each piece hangs on
-six samples around it, so a gap or a knock does not ring through the rest.  Orientation is then integrated as for any
-other simulated motion, by :func:`virest.simulation.hand_motion.integrate_motion`.
+The rate is interpolated by modified Akima polynomials (Akima 1970, doi:10.1145/321607.321609).  Each piece depends on
+the six samples around it, so a gap or a knock does not ring through the rest.  Orientation is integrated as for other
+simulated motions, by :func:`virest.simulation.hand_motion.integrate_motion`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class RecordedRate:
-    """Angular rate in camera axes at any time; before the first sample and after the last those are held."""
+    """Angular rate in camera axes at any time; held constant before the first and after the last sample."""
 
     start_s: float
     end_s: float
@@ -33,7 +33,7 @@ class RecordedRate:
     """Piecewise cubic polynomials over [start_s, end_s], values (3,)."""
 
     def at(self, time_s: Array, derivative: int = 0) -> Array:
-        """Rate in rad/s, or its time derivative, at times (...,): (..., 3)."""
+        """Rate in rad/s, or its time derivative of the given order, at times (...,): (..., 3)."""
         time_s = np.asarray(time_s, float)
         value = np.asarray(self.pieces(np.clip(time_s, self.start_s, self.end_s), nu=derivative))
         outside = (time_s < self.start_s) | (time_s > self.end_s)
@@ -43,10 +43,10 @@ class RecordedRate:
 def recorded_rate(
     sample_s: Array, gyro_rad_s: Array, profile: CameraProfile, accel_m_s2: Array | None = None
 ) -> RecordedRate:
-    """True rate of the camera, from samples (n,), (n, 3) at rising times.
+    """True rate of the camera from samples (n,), (n, 3) at increasing times.
 
-    R_cam_imu ((measured, before its low pass, − bias) / scale + fields).  sample_s: seconds on the IMU's clock from
-    stamp_0.  Raises ImuError for fewer than two samples.
+    R_cam_imu ((measured − bias) / scale + fields), the measured rate with its low-pass filter undone.  sample_s:
+    seconds on the IMU clock from stamp_0.  Raises ImuError for fewer than two samples.
     """
     if len(sample_s) < 2:
         raise ImuError(f"{len(sample_s)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
@@ -61,9 +61,9 @@ def recorded_rate(
 def recorded_motion(
     sample_s: Array, gyro_rad_s: Array, profile: CameraProfile, centre_s: float, accel_m_s2: Array | None = None
 ) -> HandMotion:
-    """A camera that turns as the gyroscope said and stays in its place; the world's axes are its own at ``centre_s``.
+    """Motion of a camera that rotates as recorded and does not translate; world axes are its own at ``centre_s``.
 
-    Arguments as :func:`recorded_rate`.
+    Other arguments as for :func:`recorded_rate`.
     """
     rate = recorded_rate(sample_s, gyro_rad_s, profile, accel_m_s2)
     still = Waves(np.zeros((3, 1)), np.zeros((3, 1)), np.zeros((3, 1)))

@@ -1,7 +1,7 @@
-"""Write a session as a MARSLogger Android capture folder, with its truth beside it.
+"""Write a session as a MARSLogger Android capture folder with its ground truth.
 
-Outside ``truth/`` stands only what a phone logs and what the nominal profile claims.  The folder appears whole or
-not at all.
+Outside ``truth/`` the folder contains only what a phone logs and what the nominal profile claims.  It appears complete
+or not at all.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from virest.simulation.session import (
 Picture = NDArray[np.uint8]
 
 LAYOUTS = ("2021", "v2.0")
-"""With Unix columns (builds after April 2021), or without (the release tagged v2.0)."""
+"""With Unix-time columns (builds after April 2021) and without (the release tagged v2.0)."""
 CLOCKS = ("REALTIME", "UNKNOWN")
 _UNIX_MINUS_BOOT_NS = 1_663_377_777_000_000_000
 _SLEPT_NS = 22_319_432_485_000
-"""Boot-time clock less monotonic clock: how long the phone has slept."""
+"""CLOCK_BOOTTIME − CLOCK_MONOTONIC: time that the phone has spent asleep."""
 _EPOCH_JITTER_NS = 8_301
 _TRAJECTORY_STEP_S = 1e-3
 _PNG_OPTIONS = [
     cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG,
 ]  # fmt: skip
-"""As small as with all of level 1's filters tried, in three fifths of the time."""
+"""Same file size as trying all filters at level 1, in 60 % of the time."""
 FOCUS_DIOPTRES = 0.16422288
-"""Logged where the focus rests."""
+"""Logged focus distance if the focus is constant."""
 _EDGE_HEADER = """\
 #Camera frame timestamp source according to CameraCharacteristics.SENSOR_INFO_TIMESTAMP_SOURCE is \
 SENSOR_INFO_TIMESTAMP_SOURCE_{source}.
@@ -69,18 +69,18 @@ nanoTime().
 
 @dataclass(frozen=True, slots=True)
 class RecordingOptions:
-    """How the files are written."""
+    """File format options."""
 
     layout: str = "2021"
     """One of LAYOUTS."""
     clock: str = "REALTIME"
-    """Clock of the camera's stamps, one of CLOCKS."""
+    """Clock of the camera timestamps, one of CLOCKS."""
     bits_per_px: float = 0.25
-    """Bit rate per pixel and frame; not used with crf."""
+    """Bit rate per pixel and frame; ignored with crf."""
     crf: float | None = None
-    """Constant quality of x264 instead of a bit rate; 0 is nearly lossless."""
+    """x264 constant rate factor, in place of a bit rate; 0 is nearly lossless."""
     middle_truth: bool = False
-    """Write truth/frame_middle too."""
+    """Also write truth/frame_middle."""
     truth_frames: bool = True
     """Write truth/frames."""
 
@@ -94,9 +94,10 @@ def write_recording(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Render and write a capture folder. Raises OutputError where ``out`` exists and is not empty.
+    """Render and write a capture folder: its path.
 
-    progress(done, total) is called after each frame.
+    overwrite: replace an existing simulated capture.  progress(done, total) is called after each frame.  Raises
+    OutputError if ``out`` is a file, or a non-empty folder without ``overwrite`` or not written by the simulator.
     """
     options = options or RecordingOptions()
     _require_options(options)
@@ -117,7 +118,7 @@ def write_recording(
 def write_movie(
     path: Path, pictures: Iterable[Picture], ticks: NDArray[np.int64], fps: float, options: RecordingOptions
 ) -> None:
-    """H.264, yuv420p, BT.601 limited range, no B-frames, a key frame every 30; exact stamps in 90 kHz ticks."""
+    """Encode H.264: yuv420p, BT.601 limited range, no B-frames, key frame every 30 frames, exact 90 kHz timestamps."""
     with av.open(str(path), "w", format="mp4") as container:
         stream: Any = None
         for picture, tick in zip(pictures, ticks.tolist(), strict=True):
@@ -131,10 +132,10 @@ def write_movie(
 
 
 def yuv_planes(picture: Picture) -> Picture:
-    """Y, Cb, Cr of BT.601 in limited range, rounded, chroma halved: (3 h / 2, w), planes one after another.
+    """Convert RGB to rounded BT.601 limited-range Y, Cb, Cr, chroma subsampled 2 × 2: (3 h / 2, w), plane after plane.
 
-    Chroma lies on the left luma column and between its two rows (the place that H.264 assumes): weights 1 2 1 across,
-    1 1 down.
+    Chroma is sited at the left luma column, midway between two rows (the H.264 default): weights 1 2 1 horizontally,
+    1 1 vertically.
     """
     height, width = picture.shape[:2]
     red, green, blue = (picture[..., i].astype(np.float32) for i in range(3))
@@ -167,11 +168,11 @@ def _require_free(out: Path, overwrite: bool) -> None:
     if not overwrite:
         raise OutputError(f"{out} exists and is not empty", hint="choose another folder, or pass --overwrite")
     if not (out / "truth" / "effects.json").is_file():
-        raise OutputError(f"{out} holds something else than a simulated capture", hint="choose another folder")
+        raise OutputError(f"{out} holds something else, not a simulated capture", hint="choose another folder")
 
 
 def _put_in_place(part: Path, out: Path) -> None:
-    """Move the finished folder to its name; what stood there goes first, aside and then away."""
+    """Rename the finished folder to ``out``; an existing folder is moved aside first and then deleted."""
     aside = part.with_name(part.name + ".old")
     if out.exists():
         os.replace(out, aside)
@@ -211,7 +212,7 @@ def _fill_folder(
 def _rendered(
     session: Session, truth: Path, options: RecordingOptions, progress: Callable[[int, int], None] | None
 ) -> Iterable[Picture]:
-    """Each slot's picture; the truth pictures are written on the way. Repeats are not rendered again."""
+    """Yield each slot's frame and write its truth frames.  Repeated captures are not rendered again."""
     total = len(session.shows)
     phone = phone_pictures(session)
     picture: Picture | None = None
@@ -250,17 +251,17 @@ def _write_png(path: Path, picture: Picture) -> None:
 
 
 def _unix_ns(boot_ns: int, delay_ns: int = 0) -> int:
-    """Unix time of a callback, cut to whole milliseconds as the app prints it."""
+    """Unix time of a callback, truncated to milliseconds as the app prints it."""
     return (boot_ns + delay_ns + _UNIX_MINUS_BOOT_NS) // 1_000_000 * 1_000_000
 
 
 def _logged_ns(stamp_ns: int, options: RecordingOptions) -> int:
-    """Put a camera stamp on the clock that the phone logs it on."""
+    """Convert a camera timestamp to the clock that the phone logs."""
     return stamp_ns - (_SLEPT_NS if options.clock == "UNKNOWN" else 0)
 
 
 def _write_table(path: Path, columns: list[str], rows: Iterable[list[str]], options: RecordingOptions) -> None:
-    """CSV as the app writes it: the release v2.0 has no last (Unix) column."""
+    """Write CSV as the app does; layout v2.0 omits the last (Unix time) column."""
     unix = options.layout == "2021"
     last = None if unix else -1
     separator = ", " if path.name == "gyro_accel.csv" and not unix else ","
@@ -276,7 +277,7 @@ def _write_stamps(folder: Path, session: Session, options: RecordingOptions) -> 
 
 
 def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -> None:
-    """Write what the phone claims: nominal focal length and readout, logged exposure and ISO."""
+    """Write per-frame metadata as the phone reports it: nominal focal length and readout, logged exposure and ISO."""
     nominal, lens = session.nominal, session.nominal.intrinsics
     fx, fy = (f"{lens.fx_px:.7g}", f"{lens.fy_px:.7g}") if lens else ("1.0", "1.0")
     readout = round(nominal.shutter.readout_time_s * 1e9)
@@ -326,7 +327,7 @@ def _write_edge_epochs(folder: Path, imu: ImuLog, options: RecordingOptions) -> 
 
 
 def _write_trajectory(truth: Path, session: Session) -> None:
-    """Camera pose in world axes each millisecond; the world's y points down."""
+    """Write the camera pose in world axes (y down) every millisecond."""
     time_s = np.arange(session.imu_span_s[0], session.imu_span_s[1], _TRAJECTORY_STEP_S)
     table = np.column_stack([time_s, session.motion.position_m(time_s), session.motion.quat_world_cam(time_s)])
     header = "time_s,px_m,py_m,pz_m,qw,qx,qy,qz"
@@ -335,7 +336,7 @@ def _write_trajectory(truth: Path, session: Session) -> None:
 
 
 def _write_effects(truth: Path, session: Session, applied: tuple[AppliedEffect, ...]) -> None:
-    """Effects with their values, the session's settings, and when each slot's picture was really taken."""
+    """Write the effects with their values, the session settings and the true capture time of each slot."""
     scene = session.scene
     slots = [
         {

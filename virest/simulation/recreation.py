@@ -1,7 +1,7 @@
-"""Take a recorded capture once more: its stamps, exposures, inertial samples and camera, before a known scene.
+"""Recreate a recorded capture with a known scene: same timestamps, exposures, inertial samples and camera.
 
-The scene is one picture, sharp and straight, laid at infinity where the camera looked when it was taken; beyond its
-edges it goes on mirrored.  The camera's translation is left out, since one picture holds no depth.
+The scene is one sharp image without rolling-shutter distortion, placed at infinity in the camera's viewing direction
+when it was taken and mirrored beyond its edges.  Camera translation is omitted, since one image carries no depth.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from virest.simulation.session import TICKS_PER_S, ImuLog, Session, SessionSetti
 
 Array = NDArray[np.float64]
 
-UNSEEN = frozenset({NO_IMU, IMU_GAP, NO_STAMP})
-"""Frames of which neither time nor motion is known cannot be taken again."""
+NOT_RECREATABLE = frozenset({NO_IMU, IMU_GAP, NO_STAMP})
+"""Skip codes of frames without a known time or motion; they cannot be recreated."""
 LEAST_AHEAD = 0.15
-"""z of the unit rays through the picture's corners, in the scene's axes: below this a picture holds no such view."""
+"""Minimum z, scene axes, of the unit rays through a frame's corners; below it the scene plane does not cover them."""
 IMU_MARGIN_S = 1.0
 _CHART_MARGIN = 1.02
-_DARKEST = 1e-3
-_RADIUS_STEPS = 5
-"""A focal length that differs over the radius by a few per cent: each step shrinks the error of its inverse so."""
+_LEAST_FACTOR = 1e-3
+_RADIUS_ITERATIONS = 5
+"""If the focal length varies over the radius by a few per cent, each iteration reduces the error by that factor."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScenePicture:
-    """What the scene is made of: a picture as a global shutter without blur takes it, and when it was taken."""
+    """Source image of the scene, as a global shutter without blur captures it, and its time."""
 
     picture: NDArray[np.uint8]
-    """(h, w, 3) RGB, of the profile's lens, vignetting and curve."""
+    """(h, w, 3) RGB with the profile's lens, vignetting and response curve."""
     frame: int
     """Movie index of the frame; the picture shows the start of its first row's exposure."""
     valid_px: tuple[int, int, int, int]
-    """x0, y0, x1, y1, the last two one past the end: what of it is real."""
+    """Valid region x0, y0, x1, y1; the end is exclusive."""
 
 
 def known_frames(frames: Sequence[Frame]) -> tuple[Frame, ...]:
-    """The frames whose times and motions are known, those of the recorder's start-up too."""
-    return tuple(frame for frame in frames if not UNSEEN & set(frame.skip_codes) and np.isfinite(frame.time_s))
+    """Frames with a known time and motion, including those of the recorder's start-up."""
+    return tuple(frame for frame in frames if not NOT_RECREATABLE & set(frame.skip_codes) and np.isfinite(frame.time_s))
 
 
 def recreate_session(
@@ -66,10 +66,10 @@ def recreate_session(
     scene: ScenePicture,
     settings: SessionSettings,
 ) -> Session:
-    """Plan the recording of these frames once more; slot k of the new movie is frames[k].
+    """Plan a recreation of these frames; slot k of the new movie is frames[k].
 
-    frames: in order, with times and exposures.  nominal, true: profiles of the capture as it was read; where the frames
-    do not begin with its first, all that counts from stamp_0 is counted anew.  settings: noise and seed are used.
+    frames: in order, with times and exposures.  nominal, true: profiles of the capture as read; values counted from
+    stamp_0 are shifted to the first of ``frames``.  settings: noise_levels, seed, oversampling and isp apply.
     """
     _require(frames, true)
     begin_s = frames[0].time_s
@@ -104,7 +104,7 @@ def recreate_session(
 
 
 def from_frame(profile: CameraProfile, frames: Sequence[Frame]) -> CameraProfile:
-    """The profile with its times counted from the first of these frames, and with the scene at infinity."""
+    """Shift the profile's times to the first of these frames, and put the scene at infinity."""
     changed = counted_from(profile, frames[0].time_s, frames[0].timestamp_ns)
     extensions, index = changed.extensions, [frame.index for frame in frames]
     lag_s, lag_frames = _lag_left(extensions, index[0])
@@ -131,26 +131,27 @@ def _require(frames: Sequence[Frame], profile: CameraProfile) -> None:
 
 
 def _lag_left(extensions: Extensions, first: int) -> tuple[float, int]:
-    """What remains of the recorder's start-up lag at a slot: it is used up evenly over the first slots."""
+    """Remaining start-up lag at slot ``first``, seconds and slots; the lag declines evenly over the first slots."""
     last = extensions.frame_lag_frames
     left = max(last - first, 0)
     return (extensions.frame_lag_s * left / last if last else 0.0), left
 
 
 def _exposures(frames: Sequence[Frame], captures: int, scene: int) -> Exposures:
-    """Logged exposures and sensitivities; light is their product against the capture that the scene is made of."""
-    ends = [*frames, *[frames[-1]] * (captures - len(frames))]
-    exposure_s = np.array([frame.exposure_s or 0.0 for frame in ends])
-    iso = np.array([round(frame.iso) if frame.iso else NOMINAL_ISO for frame in ends], np.int64)
+    """Logged exposure times and ISO; light is their product relative to capture ``scene``, 1 if an ISO is missing."""
+    padded = [*frames, *[frames[-1]] * (captures - len(frames))]
+    exposure_s = np.array([frame.exposure_s or 0.0 for frame in padded])
+    iso = np.array([round(frame.iso) if frame.iso else NOMINAL_ISO for frame in padded], np.int64)
     known = all(frame.iso for frame in frames)
     light = exposure_s * iso if known else np.ones(captures)
     return Exposures(exposure_s, iso, light / light[scene])
 
 
 def _cut_imu(capture: Capture, begin_s: float, lasting_s: float, true: CameraProfile) -> tuple[ImuLog, Array]:
-    """The capture's own samples, and their seconds from the first frame; all of them, or those about the frames.
+    """Inertial samples of the capture and their times in seconds from the first frame.
 
-    A stabiliser is at rest at the first sample, as it is at the capture's: then nothing is cut before the frames.
+    All samples if the frames span the whole capture, else those within IMU_MARGIN_S of the frames.  With a stabiliser
+    the samples before the frames are kept, since it is at rest at the capture's first sample.
     """
     imu, rows = capture.imu, np.arange(len(capture.imu))
     first_s = begin_s + (true.time_offset_s or 0.0) - IMU_MARGIN_S
@@ -165,7 +166,7 @@ def _cut_imu(capture: Capture, begin_s: float, lasting_s: float, true: CameraPro
 
 
 def _logged_focus(frames: Sequence[Frame]) -> Hidden:
-    """The focus distances that the recorder logged, to be logged again."""
+    """Focus distances as logged by the recorder, interpolated over time."""
     known = [frame for frame in frames if frame.focus_dioptres is not None]
     if not known:
         return NOTHING
@@ -175,14 +176,14 @@ def _logged_focus(frames: Sequence[Frame]) -> Hidden:
 
 
 def _slot_gain(true: CameraProfile, shows: NDArray[np.int64], slot: int) -> float:
-    """The hidden gain of a slot's picture: that of the first slot which shows it."""
+    """Hidden gain of a slot's capture: that of the first slot that shows it."""
     first = int(np.argmax(shows == shows[slot]))
     gain = true.extensions.gain
     return gain[first] if first < len(gain) else 1.0
 
 
 def _require_ahead(motion: HandMotion, view: View, session: Session, shows: NDArray[np.int64]) -> None:
-    """Raise CaptureError where a frame looks so far away that the scene's plane does not reach there."""
+    """Raise CaptureError if a frame's viewing direction falls outside the scene plane."""
     right, below = float(np.abs(view.x).max()), float(np.abs(view.y).max())
     corners = np.array([[i, j, 1.0] for i in (-right, right) for j in (-below, below)])
     corners /= np.linalg.norm(corners, axis=1, keepdims=True)
@@ -191,7 +192,7 @@ def _require_ahead(motion: HandMotion, view: View, session: Session, shows: NDAr
     if ahead.min() < LEAST_AHEAD:
         far = int(np.argmin(ahead))
         raise CaptureError(
-            f"frame {far} of those asked for looks {np.degrees(np.arccos(turns[far, 2, 2])):.0f} degrees past the "
+            f"frame {far} of those selected looks {np.degrees(np.arccos(turns[far, 2, 2])):.0f} degrees past the "
             "picture that the scene is made of",
             hint="choose fewer frames with --frames A:B",
         )
@@ -200,11 +201,13 @@ def _require_ahead(motion: HandMotion, view: View, session: Session, shows: NDAr
 def _scene(
     scene: ScenePicture, view: View, motion: HandMotion, seen_s: float, gain: float, oversampling: float
 ) -> Scene:
-    """The picture's light as a chart at infinity, where the camera looked at ``seen_s``; mirrored past what is real."""
+    """Chart at infinity from the picture's light, in the viewing direction at ``seen_s``; mirrored beyond valid_px."""
     profile = view.profile
     curve = profile.response or ResponseCurve("srgb")
-    left = sensor_light(np.ones((profile.height, profile.width, 1), np.float32), profile, gain, defocus=False)
-    light = curve.linearise(scene.picture.astype(np.float32) / 255).astype(np.float32) / np.maximum(left, _DARKEST)
+    factor = sensor_light(np.ones((profile.height, profile.width, 1), np.float32), profile, gain, defocus=False)
+    light = curve.linearise(scene.picture.astype(np.float32) / 255).astype(np.float32) / np.maximum(
+        factor, _LEAST_FACTOR
+    )
     x, y = view.rays(seen_s, slice(None), slice(None))
     reach = [_CHART_MARGIN * float(np.abs(plane).max()) for plane in (x, y)]
     lens = profile.intrinsics
@@ -216,13 +219,13 @@ def _scene(
     rays = np.stack([u, v, np.ones_like(u)], -1) @ motion.rotation(np.array([seen_s])).as_matrix()[0]
     x0, y0, x1, y1 = scene.valid_px if scene.valid_px[2] > scene.valid_px[0] else (0, 0, profile.width, profile.height)
     source = (_pixels(view, rays, seen_s) - [x0, y0]).astype(np.float32)
-    real = np.ascontiguousarray(light[y0:y1, x0:x1])
-    chart = cv2.remap(real, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    valid = np.ascontiguousarray(light[y0:y1, x0:x1])
+    chart = cv2.remap(valid, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     return Scene(np.maximum(chart, 0.0), focal)
 
 
 def _pixels(view: View, rays: Array, time_s: float) -> Array:
-    """Pixels (..., 2) that look along rays (..., 3) at a time: the inverse of :meth:`View.rays`."""
+    """Pixels (..., 2) whose rays at a time are (..., 3): the inverse of :meth:`View.rays`."""
     profile, lens = view.profile, view.profile.intrinsics
     assert lens is not None
     plane = rays[..., :2] / rays[..., 2:]
@@ -233,7 +236,7 @@ def _pixels(view: View, rays: Array, time_s: float) -> Array:
     if not focal_changes(profile, view.hidden):
         return pixels
     centre, seen = np.array([lens.cx_px, lens.cy_px]), pixels
-    for _ in range(_RADIUS_STEPS):
+    for _ in range(_RADIUS_ITERATIONS):
         radius_px = seen_radius_px(profile, seen[..., 0], seen[..., 1])
         seen = centre + (pixels - centre) * focal_scale(profile, view.hidden, time_s, radius_px)[..., None]
     return seen

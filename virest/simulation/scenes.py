@@ -1,11 +1,11 @@
-"""What the camera looks at: a radiance chart on a plane, at infinity or at a depth.
+"""Scenes: a radiance chart on a plane, at infinity or at a finite depth.
 
-A chart is linear light, float32 RGB, 1 = the light that just fills a curve that ends at 1.  It is drawn finer than the
-picture and blurred once by the lens and pixel (a Gaussian of LENS_SIGMA_PX picture pixels: contrast 0.29 at the
-picture's Nyquist frequency), so one interpolated sample a pixel gives an instant's picture without aliases.
+A chart is linear light, float32 RGB; 1 is the clip level of a response curve that ends at 1.  It is drawn at a higher
+resolution than the frame and blurred once by lens and pixel (a Gaussian of LENS_SIGMA_PX frame pixels: contrast 0.29 at
+the frame's Nyquist frequency), so one interpolated sample per pixel renders an instant without aliasing.
 
-Dead leaves: occluding discs, ellipses and polygons whose radii follow r⁻³, which gives the scale invariance of natural
-pictures (Lee, Mumford & Huang 2001, doi:10.1023/A:1011109015675), here with 1/f texture and shading inside each leaf.
+Dead leaves: occluding discs, ellipses and polygons with radii distributed as r⁻³, which reproduces the scale invariance
+of natural images (Lee, Mumford & Huang 2001, doi:10.1023/A:1011109015675), with 1/f texture and shading inside each.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ KINDS = ("leaves", "bright", "board", "text", "photographs")
 LENS_SIGMA_PX = 0.5
 MAX_CHART_PX = 36_000_000
 PHOTOGRAPHS = ("astronaut", "chelsea", "coffee", "rocket")
-"""Of scikit-image's data, in colour: a portrait, fur, a table, a rocket before the night."""
+"""Colour photographs in scikit-image: a portrait, fur, a table, a rocket at night."""
 _TEXTURE_SIDE = 512
 _TEXT = (
     "the quick brown fox jumps over the lazy dog",
@@ -42,24 +42,25 @@ _TEXT = (
 class Scene:
     """A chart on a plane.
 
-    In world axes the plane passes through (0, 0, depth_m) with the given normal; its chart axes are the world's x and y
-    laid into the plane.  With ``depth_m`` infinite only directions count: the plane z = 1 seen from the origin.
+    The plane passes through (0, 0, depth_m), world axes, with the given normal.  The chart's x axis is the world's,
+    projected into the plane; its y axis completes the right-handed frame.  With infinite ``depth_m`` only directions
+    matter: the plane z = 1 seen from the origin.
     """
 
     chart: NDArray[Any]
     """(rows, columns, 3) linear light."""
     chart_focal_px: float
-    """Chart pixels per unit of x/z: at the chart's middle, that many times finer than a camera of focal length 1 px."""
+    """Chart focal length: chart pixels per unit of x/z at the chart's centre."""
     depth_m: float = np.inf
     """Distance of the plane along the world's z axis."""
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit normal of the plane, world axes."""
     drift_per_s: tuple[float, float] = (0.0, 0.0)
-    """How fast the chart slides along its x and y axes, in units of x/z a second."""
+    """Velocity of the chart along its x and y axes, units of x/z per second."""
 
     @property
     def fastest_per_s(self) -> float:
-        """Greatest speed of anything in the scene by itself, in units of x/z a second."""
+        """Maximum speed of scene motion, units of x/z per second."""
         return float(np.hypot(*self.drift_per_s))
 
     def chart_from_ray(
@@ -70,10 +71,9 @@ class Scene:
     ) -> NDArray[np.float64]:
         """Homography from rays (x, y, 1) in camera axes to homogeneous chart pixels, for poses (..., 3, 3), (..., 3).
 
-        time_s: (...,) when each pose is taken; it only counts where the chart slides.
+        time_s: (...,) time of each pose; it matters only if the chart moves.
 
-        A ray d from p meets the plane n·X = n·X0 at ``X = p + d n·(X0 − p)/(n·d)``, linear in d up
-        to the division.
+        A ray d from p meets the plane n·X = n·X0 at ``X = p + d n·(X0 − p)/(n·d)``, linear in d up to the division.
         """
         rotation = np.asarray(rotation_world_cam, float)
         position = np.asarray(position_m, float)
@@ -100,11 +100,11 @@ class Scene:
         return matrices
 
     def at_plane(self, depth_m: float, normal: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Scene:
-        """Put the same chart on a plane at another depth; it looks as large as before from the origin."""
+        """Move the chart to a plane at another depth; its angular size at the origin is unchanged."""
         return Scene(self.chart, self.chart_focal_px, depth_m, normal, self.drift_per_s)
 
     def sample(self, homography: NDArray[np.float64], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
-        """Light along rays (x, y, 1), bilinear between chart pixels, mirrored outside the chart: (h, w, 3)."""
+        """Light along rays (x, y, 1), bilinear between chart pixels, mirrored outside: (h, w, channels)."""
         h = homography.astype(np.float32)
         weight = 1.0 / (h[2, 0] * x + (h[2, 1] * y + h[2, 2]))
         map_x = h[0, 0] * x + (h[0, 1] * y + h[0, 2])
@@ -116,17 +116,17 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class ReliefScene(Scene):
-    """A chart with things before it: several planes, each nearer one painted over those behind it.
+    """A chart with objects in front: several planes, each occluding those listed before it.
 
-    Homographies come in stacks, (..., planes, 3, 3): the farthest plane's first.
+    Homographies are stacked (..., planes, 3, 3), background first.
     """
 
     nearer: tuple[Scene, ...] = ()
-    """The other planes; their charts hold light × cover in three channels and cover, 0 to 1, in a fourth."""
+    """Planes in front, back to front; their charts hold light × opacity in channels 0 to 2 and opacity in channel 3."""
 
     @property
     def fastest_per_s(self) -> float:
-        """Greatest speed of anything in the scene by itself, in units of x/z a second."""
+        """Maximum speed of scene motion, units of x/z per second."""
         return max(float(np.hypot(*plane.drift_per_s)) for plane in (self, *self.nearer))
 
     def chart_from_ray(
@@ -135,17 +135,17 @@ class ReliefScene(Scene):
         position_m: NDArray[np.float64],
         time_s: NDArray[np.float64] | float = 0.0,
     ) -> NDArray[np.float64]:
-        """All planes' homographies, as :meth:`Scene.chart_from_ray`: (..., planes, 3, 3)."""
+        """Homographies of all planes, as :meth:`Scene.chart_from_ray`: (..., planes, 3, 3)."""
         farthest = Scene(self.chart, self.chart_focal_px, self.depth_m, self.normal, self.drift_per_s)
         planes = (farthest, *self.nearer)
         return np.stack([p.chart_from_ray(rotation_world_cam, position_m, time_s) for p in planes], axis=-3)
 
     def sample(self, homography: NDArray[np.float64], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
-        """Light along rays: that of the nearest plane that covers it: (h, w, 3)."""
+        """Light along rays, the planes composited back to front: (h, w, 3)."""
         light = Scene.sample(self, homography[0], x, y)
-        for plane, seen in zip(self.nearer, homography[1:], strict=True):
-            before = plane.sample(seen, x, y)
-            light = light * (1 - before[..., 3:]) + before[..., :3]
+        for plane, plane_homography in zip(self.nearer, homography[1:], strict=True):
+            layer = plane.sample(plane_homography, x, y)
+            light = light * (1 - layer[..., 3:]) + layer[..., :3]
         return light
 
 
@@ -159,19 +159,19 @@ def hang_before(
     size: float = 0.13,
     drift_per_s: tuple[float, float] = (0.0, 0.0),
 ) -> ReliefScene:
-    """Hang discs, ellipses and polygons of leaves' texture on a nearer plane, facing the camera.
+    """Add discs, ellipses and polygons with dead-leaves texture on a nearer plane z = depth_m.
 
-    focal_px: of the camera, as for :func:`make_scene`.  size: mean radius in units of x/z, as seen from the origin.
-    drift_per_s: how fast they all move.
+    focal_px: the camera's, as for :func:`make_scene`.  size: mean radius in units of x/z, seen from the origin.
+    drift_per_s: their common velocity.
     """
     height, width = scene.chart.shape[:2]
     oversampling = scene.chart_focal_px / focal_px
-    cover = np.zeros((height, width), np.float32)
+    opacity = np.zeros((height, width), np.float32)
     for _ in range(things):
         centre = rng.uniform((0, 0), (width, height))
-        _fill_leaf(cover, rng, centre, float(rng.uniform(0.5, 1.5)) * size * scene.chart_focal_px, 1.0)
+        _fill_leaf(opacity, rng, centre, float(rng.uniform(0.5, 1.5)) * size * scene.chart_focal_px, 1.0)
     drawing = _draw_leaves(rng, width, height, oversampling)
-    layers = np.dstack([drawing * cover[..., None], cover])
+    layers = np.dstack([drawing * opacity[..., None], opacity])
     layers = cv2.GaussianBlur(layers, (0, 0), LENS_SIGMA_PX * oversampling, borderType=cv2.BORDER_REFLECT)
     near = Scene(layers, scene.chart_focal_px, depth_m, drift_per_s=drift_per_s)
     others = scene.nearer if isinstance(scene, ReliefScene) else ()
@@ -181,13 +181,13 @@ def hang_before(
 
 
 MOVING_LAYERS, MOVING_THINGS, MOVING_SIZE = 3, 4, 0.09
-"""Planes of things that move, things on each, and their mean radius in units of x/z: about a fifth of the picture."""
+"""Planes of moving objects, objects per plane, mean radius in units of x/z; together about 20 % of the frame."""
 
 
 def move_things_before(scene: Scene, rng: np.random.Generator, *, speed_px_s: float, focal_px: float) -> ReliefScene:
-    """Let things as far away as the scene move across it, each plane of them in its own direction.
+    """Add planes of objects at the scene's depth that move across it, each plane in its own direction.
 
-    speed_px_s: in the picture of a camera of focal_px that stands still.
+    speed_px_s: mean speed in the image of a stationary camera of focal length focal_px; each plane's is within ±30 %.
     """
     first = rng.uniform(0, 2 * np.pi)
     for layer in range(MOVING_LAYERS):
@@ -213,11 +213,11 @@ def make_scene(
     oversampling: float = 2.0,
     lens_sigma_px: float = LENS_SIGMA_PX,
 ) -> Scene:
-    """Draw a scene of one of KINDS for a camera of ``focal_px``.
+    """Draw a scene of one of KINDS for a camera of focal length ``focal_px``.
 
-    half_extent: how far x/z and y/z reach from the middle of the chart.  oversampling: chart pixels per picture pixel
-    at the middle; it is lowered (with a log message) where the chart would exceed MAX_CHART_PX.  lens_sigma_px: blur
-    of lens and pixel, in that camera's picture pixels.
+    half_extent: range of x/z and y/z on each side of the chart's centre.  oversampling: chart pixels per frame pixel at
+    the centre; reduced (with a log message) if the chart would exceed MAX_CHART_PX.  lens_sigma_px: blur of lens and
+    pixel, in frame pixels of that camera.
     """
     if kind not in KINDS:
         raise SettingsError(f"scene '{kind}' is not known", hint=f"use one of {', '.join(KINDS)}")
@@ -238,14 +238,14 @@ def make_scene(
 
 
 def _draw_leaves(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
-    """Dead leaves with texture and shading; darkest about 0.01, brightest about 0.9."""
+    """Dead leaves with texture and shading, clipped to 0.004 … 0.9."""
     labels, count = _leaf_labels(rng, width, height, scale)
     colour = _natural_colours(rng, count)
     return np.clip(_textured(rng, labels, colour), 0.004, 0.9)
 
 
 def _draw_bright(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
-    """Dead leaves with lamps and glints of 2 to 12 times the clip level on about 3 % of the area."""
+    """Dead leaves with highlights of 1.5 to 12 times the clip level on about 3 % of the area."""
     light = _draw_leaves(rng, width, height, scale)
     target, covered, tries = 0.03 * width * height, 0.0, 0
     while covered < target and tries < 20_000:
@@ -259,7 +259,7 @@ def _draw_bright(rng: np.random.Generator, width: int, height: int, scale: float
 
 
 def _draw_board(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
-    """Draw a chessboard on a white sheet before a grey wall, with solid tag-like squares in its white fields."""
+    """Chessboard on a white sheet before a grey wall, with AprilTag-like codes in the white squares."""
     light = np.full((height, width, 3), 0.25, np.float32)
     columns, rows = (7, 10) if height >= width else (10, 7)
     side = int(0.55 * min(width / columns, height / rows))
@@ -279,7 +279,7 @@ def _draw_board(rng: np.random.Generator, width: int, height: int, scale: float)
 
 
 def _draw_tag(light: NDArray[Any], rng: np.random.Generator, x: int, y: int, side: int) -> None:
-    """Draw a square code of 6 x 6 black and white cells with a black border."""
+    """Draw a square code of 6 × 6 black and white cells with a black border."""
     cell = max(side // 8, 1)
     light[y : y + 8 * cell, x : x + 8 * cell] = 0.03
     bits = rng.integers(0, 2, (6, 6))
@@ -289,7 +289,7 @@ def _draw_tag(light: NDArray[Any], rng: np.random.Generator, x: int, y: int, sid
 
 
 def _draw_text(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
-    """Draw printed pages: dark text of several sizes on off-white paper, shaded slowly."""
+    """Printed page: dark text of several sizes on off-white paper with slowly varying shading."""
     ink = np.zeros((height, width), np.uint8)
     y = int(20 * scale)
     while y < height + 10:
@@ -310,7 +310,7 @@ def _draw_text(rng: np.random.Generator, width: int, height: int, scale: float) 
 
 
 def _draw_photographs(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
-    """Photographs side by side, row above row, as fine as the picture: colours and brightness that go together."""
+    """Photographs tiled in rows, one photograph pixel per frame pixel; their colour and brightness are correlated."""
     try:
         from skimage import data
     except ImportError:
@@ -335,7 +335,7 @@ def _draw_photographs(rng: np.random.Generator, width: int, height: int, scale: 
 _SRGB_LIGHT = np.where(
     np.arange(256) <= 10, np.arange(256) / 255 / 12.92, ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4
 ).astype(np.float32)
-"""Light of the grey levels of an ordinary picture file (IEC 61966-2-1)."""
+"""Linear light of each 8-bit sRGB level (IEC 61966-2-1)."""
 _DRAWINGS = {
     "leaves": _draw_leaves,
     "bright": _draw_bright,
@@ -349,7 +349,7 @@ _DRAWINGS = {
 
 
 def _leaf_labels(rng: np.random.Generator, width: int, height: int, scale: float) -> tuple[NDArray[np.int32], int]:
-    """Which leaf is on top at each chart pixel; leaf 0 is the ground."""
+    """Topmost leaf at each chart pixel (0: background), and the number of labels."""
     small, large = 4.5 * scale, 0.25 * min(width, height) + 5 * scale
     mean_area = 2 * np.pi * small**2 * np.log(large / small) / (1 - (small / large) ** 2)
     count = int(min(4.0 * width * height / mean_area, 150_000))
@@ -362,13 +362,13 @@ def _leaf_labels(rng: np.random.Generator, width: int, height: int, scale: float
 
 
 def _power_radii(rng: np.random.Generator, count: int, small: float, large: float) -> NDArray[np.float64]:
-    """Radii with density r⁻³ between the two ends."""
+    """Radii with density ∝ r⁻³ between small and large."""
     u = rng.uniform(size=count)
     return 1.0 / np.sqrt((1 - u) / small**2 + u / large**2)
 
 
 def _fill_leaf(canvas: NDArray[Any], rng: np.random.Generator, centre: NDArray[Any], radius: float, value: Any) -> None:
-    """Fill a disc, an ellipse or a polygon, to 1/16 pixel."""
+    """Fill a random disc, ellipse or polygon, coordinates to 1/16 pixel."""
     shape, angle, aspect = rng.uniform(size=3)
     at = (int(centre[0] * 16), int(centre[1] * 16))
     if shape < 0.35:
@@ -385,7 +385,7 @@ def _fill_leaf(canvas: NDArray[Any], rng: np.random.Generator, centre: NDArray[A
 
 
 def _natural_colours(rng: np.random.Generator, count: int) -> NDArray[Any]:
-    """Linear RGB (count, 3): log-normal luminance around 0.16, muted hues along blue-yellow and red-green."""
+    """Linear RGB (count, 3): log-normal luminance with median 0.16, muted hues along blue–yellow and red–green."""
     luminance = np.clip(0.16 * np.exp(rng.normal(0, 0.7, count)), 0.012, 0.8)
     yellow, red = rng.normal(0, 0.22, count), rng.normal(0, 0.09, count)
     tint = np.exp(np.stack([0.5 * yellow + red, 0.15 * yellow - 0.5 * red, -yellow], axis=1))
@@ -393,7 +393,7 @@ def _natural_colours(rng: np.random.Generator, count: int) -> NDArray[Any]:
 
 
 def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArray[Any]) -> NDArray[Any]:
-    """Each leaf's colour times its own cut of a 1/f texture and of a slow shading field."""
+    """Each leaf's colour times its own crop of a 1/f texture, times a smooth shading field over the chart."""
     height, width = labels.shape
     texture = _one_over_f(rng, _TEXTURE_SIDE)
     strength = (rng.gamma(2.0, 0.07, len(colour))).astype(np.float32)
@@ -404,15 +404,15 @@ def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArr
     for top in range(0, height, 256):
         leaf = labels[top : top + 256]
         rows = np.arange(top, top + leaf.shape[0], dtype=np.int32)[:, None]
-        place = (rows + down[leaf]) % _TEXTURE_SIDE * _TEXTURE_SIDE + (columns + right[leaf]) % _TEXTURE_SIDE
-        cut = texture.take(place)
-        factor = np.exp(strength.take(leaf) * cut) * shade[top : top + 256]
+        index = (rows + down[leaf]) % _TEXTURE_SIDE * _TEXTURE_SIDE + (columns + right[leaf]) % _TEXTURE_SIDE
+        crop = texture.take(index)
+        factor = np.exp(strength.take(leaf) * crop) * shade[top : top + 256]
         light[top : top + 256] = colour.take(leaf, axis=0) * factor[..., None]
     return light
 
 
 def _one_over_f(rng: np.random.Generator, side: int) -> NDArray[Any]:
-    """Draw a periodic texture whose amplitude falls as 1/f, mean 0, standard deviation 1: (side, side)."""
+    """Periodic texture with a 1/f amplitude spectrum, mean 0, standard deviation 1: (side, side)."""
     fy, fx = np.meshgrid(np.fft.fftfreq(side), np.fft.rfftfreq(side), indexing="ij")
     radius = np.hypot(fx, fy)
     radius[0, 0] = np.inf
@@ -422,7 +422,7 @@ def _one_over_f(rng: np.random.Generator, side: int) -> NDArray[Any]:
 
 
 def _smooth_field(rng: np.random.Generator, width: int, height: int) -> NDArray[Any]:
-    """Slow variation over the chart, of about unit size."""
+    """Smooth random field over the chart, of about unit amplitude."""
     coarse = rng.normal(size=(6, 6)).astype(np.float32)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
 

@@ -1,6 +1,7 @@
 """From light to grey levels, in the contract's order: defocus, vignetting, gain, curve, gamma, black level, noise.
 
-The curve is written down here once more, from the paper's equations 21 and 22, so that the judge has its own.
+The response curve is implemented here a second time, from equations 21 and 22 of the paper, so that the simulator is
+independent of restoration.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ Image = NDArray[Any]
 
 
 def sensor_light(light: Image, profile: CameraProfile, slot_gain: float, *, defocus: bool) -> Image:
-    """Light as it reaches the curve: defocused (where asked for), vignetted, times the frame's gain: (h, w, 3)."""
+    """Light at the response curve's input (h, w, 3): defocus (if requested), vignetting, gain fields, slot gain."""
     ext = profile.extensions
     if defocus and ext.defocus_sigma_px:
         light = cv2.GaussianBlur(light, (0, 0), ext.defocus_sigma_px, borderType=cv2.BORDER_REFLECT)
@@ -40,7 +41,7 @@ def grey_of_light(light: Image, curve: ResponseCurve) -> Image:
 
 
 def eight_bit(grey: Image, noise_levels: float, rng: np.random.Generator | None) -> NDArray[np.uint8]:
-    """Grey levels 0 to 255 with Gaussian noise of ``noise_levels`` (none without rng), rounded."""
+    """Grey levels rounded to 0–255, with Gaussian noise of standard deviation ``noise_levels`` (none without rng)."""
     return round_levels(noisy_levels(grey, noise_levels, rng))
 
 
@@ -53,7 +54,7 @@ def noisy_levels(grey: Image, noise_levels: float, rng: np.random.Generator | No
 
 
 def round_levels(levels: Image) -> NDArray[np.uint8]:
-    """Whole grey levels, 0 to 255."""
+    """Round and clip to grey levels 0–255."""
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
 
 
@@ -78,7 +79,7 @@ def _plain_curve(light: Image, curve: ResponseCurve) -> Image:
 
 
 def _five_segments(light: Image, b: tuple[float, float], c: tuple[float, float], top: float) -> Image:
-    """Zero, toe, line, shoulder, top; toe and shoulder are parabolas that meet the line with its slope."""
+    """Zero, toe, line, shoulder, top; the toe and shoulder parabolas meet the line with matching slope."""
     slope = (c[1] - b[1]) / (c[0] - b[0])
     foot, head = b[0] - 2 * b[1] / slope, c[0] + 2 * (top - c[1]) / slope
     grey = b[1] + slope * (light - b[0])

@@ -1,7 +1,7 @@
-"""One simulated recording session: what is looked at, how the hand moves, when each frame is exposed, what is logged.
+"""A simulated recording session: scene, hand motion, exposure times of each frame, and logs.
 
-Clocks (contract, section 4): ``t_imu − stamp_0 = (t_cam − stamp_0)(1 + clock_skew) + time_offset_s``; a stamp that
-means the middle or the end lies half or one true exposure after the start.  Rows follow on the IMU's clock.
+Clocks (contract, section 4): ``t_imu − stamp_0 = (t_cam − stamp_0)(1 + clock_skew) + time_offset_s``.  A timestamp of
+the exposure's middle or end lies half or one true exposure time after its start.  Row delays are on the IMU clock.
 """
 
 from __future__ import annotations
@@ -37,96 +37,97 @@ LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 GRAVITY_WORLD_M_S2 = np.array([0.0, 9.81, 0.0])
 """World y points down."""
 TICKS_PER_S = 90_000
-"""Time base of the movie; stamps are its ticks, cut to whole microseconds."""
-STAMP_PLACE = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}
+"""Time base of the movie; timestamps are its ticks, truncated to microseconds."""
+STAMP_FRACTION = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}
+"""Position of the timestamp within the exposure."""
 DEFAULT_SWAY_M = 0.012
-"""RMS sway of the hand where the scene has a depth and no sway is asked for."""
+"""Default RMS sway of the hand for a scene of finite depth."""
 LONGEST_EXPOSURE_S = 10.0
 LONGEST_OFFSET_S = 600.0
 FASTEST_HAND_RAD_S = 100.0
 NEAREST_M, FARTHEST_M = 0.001, 1e6
 FOCAL_OF_LONG_SIDE = (0.05, 100.0)
-"""What the renderer takes; beyond, arrays outgrow the memory or numbers lose their digits."""
+"""Limits of the renderer, the focal length as a multiple of the long side; beyond them memory or precision runs out."""
 WHOLE_FRAMES = ("delay", ("time",))
-"""Fields that make all rows of a frame late."""
+"""Kind and covariates of fields that delay all rows of a frame."""
 _IMU_LEAD_S = 0.6
 _SCENE_MARGIN = 1.12
 
 
 @dataclass(frozen=True, slots=True)
 class SessionSettings:
-    """What is recorded and how; the camera itself is a profile."""
+    """Recording settings; the camera itself is described by a profile."""
 
     scene: str = "leaves"
     frames: int = 12
     fps: float = 30.0
     exposure_s: tuple[float, ...] = (0.010,)
-    """As logged; frame k takes entry k modulo the length. The ISO compensates for a change: the light stays."""
+    """Logged exposure times, used cyclically; ISO compensates, so brightness is constant without auto-exposure."""
     auto_exposure: AutoExposure | None = None
-    """Exposure × ISO moves, and the picture's brightness with it; None: it stays."""
+    """Variation of exposure × ISO, and with it of brightness; None: constant."""
     rate_rad_s: float = 1.0
-    """RMS of the angular rate; 0: the camera does not turn, and without a sway stands still, as on a tripod."""
+    """RMS angular rate; 0: no rotation by the hand, as on a tripod if there is no sway."""
     sway_m: float | None = None
-    """RMS of the sway; None: DEFAULT_SWAY_M where the scene has a depth, else none."""
+    """RMS sway; None: DEFAULT_SWAY_M for a scene of finite depth, else 0."""
     pan_rad_s: float = 0.0
-    """Steady turn about the camera's vertical axis, on top of the hand's."""
+    """Constant rate about the camera's y axis, added to the hand's."""
     tilt_rad: tuple[float, float] = (0.0, 0.0)
-    """Turn of the scene's plane about world x and y; only with a finite depth."""
+    """Rotation vector of the scene plane about world x and y; only with a finite depth."""
     near_m: float | None = None
-    """Distance of things that hang before the scene; None: none do."""
+    """Distance of objects in front of the scene; None: no objects."""
     moving_px_s: float = 0.0
-    """Speed of things that move across the scene, in the picture of a camera at rest; 0: there are none."""
+    """Speed of objects that move across the scene, in the image of a stationary camera; 0: no objects."""
     noise_levels: float = 1.5
-    """Standard deviation of the noise in grey levels of 255."""
+    """Standard deviation of the image noise, in grey levels of 0–255."""
     imu_rate_hz: float = 200.0
     gyro_noise_rad_s: float = 0.0015
     accel_noise_m_s2: float = 0.02
     seed: int = 0
     oversampling: float = 2.0
-    """Chart pixels per picture pixel."""
+    """Chart pixels per frame pixel."""
     isp: PhoneIsp = OFF
-    """The phone's own processing; its offset and stabiliser stand in the true profile."""
+    """The phone's own processing; its time offset and stabiliser belong in the true profile."""
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A recording that is planned and not yet rendered."""
+    """A planned recording, not yet rendered."""
 
     nominal: CameraProfile
-    """What the capture's camera.yaml will say."""
+    """Profile written to the capture's camera.yaml."""
     true: CameraProfile
-    """What the simulated camera is."""
+    """Profile of the simulated camera."""
     settings: SessionSettings
     scene: Scene
     motion: HandMotion
     view: View
     stamp_tick: NDArray[np.int64]
-    """(frames,) movie time stamps in ticks, first 0."""
+    """(frames,) movie timestamps in ticks from the first frame."""
     stamp_ns: NDArray[np.int64]
-    """(frames,) frame stamps, on the camera's clock."""
+    """(frames,) frame timestamps, camera clock."""
     shows: NDArray[np.int64]
-    """(frames,) which capture each slot of the movie shows; the slot's own index without start-up lag."""
+    """(frames,) index of the capture that each movie slot shows; equal to the slot's index without start-up lag."""
     imu_span_s: tuple[float, float]
-    """First and last inertial sample."""
+    """Times of the first and last inertial sample."""
     exposures: Exposures
-    """Of every capture, the first ``frames`` of them shown or not."""
+    """Exposures of all captures: at least ``frames`` of them, shown or not."""
     capture_s: Array | None = None
-    """(captures,) stamp of every capture from stamp_0, camera clock; None: even, at the settings' frame rate."""
+    """(captures,) timestamp of each capture from stamp_0, camera clock; None: evenly spaced at settings.fps."""
     recorded_imu: ImuLog | None = None
-    """Samples of a phone, to be written as they are; None: worked out from the motion."""
+    """A phone's samples, written unchanged; None: samples are computed from the motion."""
     hidden: Hidden = NOTHING
-    """Effects that no profile names."""
+    """Effects that no profile describes."""
 
     def logged_exposure_s(self, capture: int) -> float:
-        """Exposure that the log gives for a capture."""
+        """Logged exposure time of a capture."""
         return float(self.exposures.logged_s[capture])
 
     def true_exposure_s(self, capture: int) -> float:
-        """Exposure that the sensor made."""
+        """True exposure time of a capture."""
         return self.logged_exposure_s(capture) * self.true.shutter.exposure_scale
 
     def stamp_s(self, capture: int) -> float:
-        """Stamp of a capture from stamp_0, camera clock."""
+        """Timestamp of a capture from stamp_0, camera clock."""
         return _stamp_s(capture, self.settings.fps) if self.capture_s is None else float(self.capture_s[capture])
 
     def first_row_start_s(self, capture: int) -> float:
@@ -136,7 +137,7 @@ class Session:
         return _first_row_start_s(self.true, stamp_s, self.true_exposure_s(capture)) + late_s
 
     def middle_s(self, capture: int) -> float:
-        """Start of the first row + half the readout + half the exposure."""
+        """Middle of the frame: start of the first row + half the readout + half the exposure."""
         half = 0.5 * (self.true.shutter.readout_time_s + self.true_exposure_s(capture))
         return self.first_row_start_s(capture) + half
 
@@ -146,11 +147,11 @@ class ImuLog:
     """Inertial samples as the phone logs them."""
 
     time_ns: NDArray[np.int64]
-    """(n,)."""
+    """(n,) sample times."""
     gyro_rad_s: Array
     """(n, 3) IMU axes."""
     accel_m_s2: Array
-    """(n, 3) IMU axes, specific force."""
+    """(n, 3) specific force, IMU axes."""
 
 
 def nominal_camera(
@@ -164,19 +165,19 @@ def nominal_camera(
     distortion: tuple[str, tuple[float, ...]] = ("none", ()),
     depth_m: float = np.inf,
 ) -> CameraProfile:
-    """Describe a phone held upright (height > width) or on its side, focal length 0.8 of the long side unless given.
+    """Profile of a phone held in portrait (height > width) or landscape; default focal length 0.8 × the long side.
 
-    readout_direction: right_to_left for an upright phone and top_to_bottom for one on its side, unless given.
+    readout_direction: default right_to_left in portrait, top_to_bottom in landscape.
     """
     focal = 0.8 * max(width, height) if focal_px is None else focal_px
-    upright = height > width
+    portrait = height > width
     return CameraProfile(
         width=width,
         height=height,
         device="simulated phone",
         intrinsics=Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, *distortion),
-        shutter=Shutter(readout_time_s, readout_direction or ("right_to_left" if upright else "top_to_bottom")),
-        r_cam_imu=ANDROID_R_CAM_IMU if upright else LANDSCAPE_R_CAM_IMU,
+        shutter=Shutter(readout_time_s, readout_direction or ("right_to_left" if portrait else "top_to_bottom")),
+        r_cam_imu=ANDROID_R_CAM_IMU if portrait else LANDSCAPE_R_CAM_IMU,
         time_offset_s=0.0,
         response=response or ResponseCurve("srgb"),
         focal_length_mm=3.95,
@@ -193,7 +194,7 @@ def plan_session(
     motion: HandMotion | None = None,
     hidden: Hidden = NOTHING,
 ) -> Session:
-    """Draw scene and motion (unless given) and lay out the times. The same seed gives the same session."""
+    """Draw scene and motion (unless given) and plan all times.  The same seed gives the same session."""
     _require_sizes(true, settings)
     duration = settings.frames / settings.fps
     offset = abs(true.time_offset_s or 0.0)
@@ -202,7 +203,7 @@ def plan_session(
     depth = scene_depth_m(true)
     if motion is None:
         sway = settings.sway_m if settings.sway_m is not None else (DEFAULT_SWAY_M if np.isfinite(depth) else 0.0)
-        # whole seconds: a small effect must not change where the integration starts, nor its last digits
+        # whole seconds: a small effect must not move the start of the integration and so change its rounding
         spare = np.ceil(lead + 0.6 + true.extensions.frame_lag_s + abs(true.clock_skew) * duration)
         motion = random_hand_motion(
             np.random.default_rng([settings.seed, 1]),
@@ -231,9 +232,9 @@ def plan_session(
 
 
 def render_picture(session: Session, slot: int, phone: PhonePictures | None = None) -> Picture:
-    """Take the picture for a slot of the movie, before the encoder: (h, w, 3) RGB.
+    """Render the frame of a movie slot as the encoder receives it: (h, w, 3) RGB.
 
-    phone: the phone's pipeline, which remembers the pictures before this one; None: the curve and noise alone.
+    phone: the phone's pipeline, which keeps state from earlier frames; None: response curve and noise alone.
     """
     capture = int(session.shows[slot])
     light = expose(
@@ -252,9 +253,10 @@ def render_picture(session: Session, slot: int, phone: PhonePictures | None = No
 
 
 def render_truth(session: Session, slot: int, *, middle: bool = False) -> Picture:
-    """Take what a global shutter without blur, defocus, flicker, noise sees at the slot's reference time: (h, w, 3).
+    """Render a slot as a global shutter sees it without blur, defocus, flicker or noise: (h, w, 3).
 
-    Of the phone's processing it has what acts on every pixel alike, the highlights and the global tone curve.
+    middle: at the middle of the frame instead of the start of the first row.  Of the phone's processing only the
+    per-pixel steps are applied, highlight roll-off and the global tone curve.
     """
     capture = int(session.shows[slot])
     time_s = session.middle_s(capture) if middle else session.first_row_start_s(capture)
@@ -265,13 +267,13 @@ def render_truth(session: Session, slot: int, *, middle: bool = False) -> Pictur
 
 
 def phone_pictures(session: Session) -> PhonePictures | None:
-    """A new pipeline of the session's phone; None where it does nothing between the noise and the encoder."""
+    """A new image pipeline of the session's phone; None if no step between noise and encoder is on."""
     settings = session.settings
     return PhonePictures(settings.isp, settings.noise_levels / 255) if settings.isp.develops else None
 
 
 def sample_imu(session: Session) -> ImuLog:
-    """Gyroscope (scale × true + bias + noise) and accelerometer, at the IMU's place and in its axes."""
+    """Gyroscope (scale × true + bias + noise) and accelerometer samples, at the IMU's position and in its axes."""
     if session.recorded_imu is not None:
         return session.recorded_imu
     settings, true = session.settings, session.true
@@ -295,13 +297,13 @@ def sample_imu(session: Session) -> ImuLog:
 
 
 def _require_sizes(profile: CameraProfile, settings: SessionSettings) -> None:
-    """Refuse what no camera does and what would never end: a value of the camera, of the times, of the motion."""
+    """Raise SettingsError for a camera, timing or motion that is impossible or too expensive to render."""
 
     def refuse(what: str, hint: str) -> None:
         raise SettingsError(f"simulation: {what}", hint=hint)
 
     if profile.width <= 0 or profile.height <= 0:
-        refuse(f"{profile.width}x{profile.height} is no picture size", "ask for at least 16x16")
+        refuse(f"{profile.width}x{profile.height} is not a valid picture size", "ask for at least 16x16")
     if profile.width % 2 or profile.height % 2:
         refuse(f"{profile.width}x{profile.height} is odd", "H.264 needs even width and height")
     if settings.frames < 1:
@@ -330,7 +332,7 @@ def _require_sizes(profile: CameraProfile, settings: SessionSettings) -> None:
 
 
 def _require_renderable(profile: CameraProfile, refuse: Callable[[str, str], None]) -> None:
-    """Sizes that a profile may have and the renderer cannot."""
+    """Refuse profile values that are valid but beyond the renderer's limits."""
     lens, offset, depth = profile.intrinsics, profile.time_offset_s or 0.0, profile.depth_m
     if lens is not None:
         low, high = (times * max(profile.width, profile.height) for times in FOCAL_OF_LONG_SIDE)
@@ -343,7 +345,7 @@ def _require_renderable(profile: CameraProfile, refuse: Callable[[str, str], Non
 
 
 def scene_depth_m(profile: CameraProfile) -> float:
-    """Distance of the scene; infinite where the profile names none."""
+    """Distance of the scene; infinite if the profile has none."""
     return np.inf if profile.depth_m is None else profile.depth_m
 
 
@@ -352,12 +354,12 @@ def _stamp_tick(index: int, fps: float) -> int:
 
 
 def _stamp_s(index: int, fps: float) -> float:
-    """Stamp of a capture from stamp_0, camera clock: its tick, cut to a whole microsecond."""
+    """Timestamp of a capture from stamp_0, camera clock: its tick, truncated to a microsecond."""
     return (_stamp_tick(index, fps) * 1_000_000 // TICKS_PER_S) * 1e-6
 
 
 def _first_row_start_s(true: CameraProfile, stamp_s: float, true_exposure_s: float) -> float:
-    start_cam = stamp_s - STAMP_PLACE[true.shutter.timestamp] * true_exposure_s
+    start_cam = stamp_s - STAMP_FRACTION[true.shutter.timestamp] * true_exposure_s
     late_s = sum(
         float(f.at_time(start_cam)[0]) for f in true.extensions.field if (f.kind, f.covariates) == WHOLE_FRAMES
     )
@@ -365,7 +367,7 @@ def _first_row_start_s(true: CameraProfile, stamp_s: float, true_exposure_s: flo
 
 
 def shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[np.int64]:
-    """Slot k shows capture k + lag − repeats so far; the repeats are spread over slots 1 … frames."""
+    """Capture shown by each slot k: k + lag − repeats up to k, repeats spread over slots 1 … frame_lag_frames."""
     slots = np.arange(settings.frames)
     last = true.extensions.frame_lag_frames
     lag = round(true.extensions.frame_lag_s * settings.fps)
@@ -380,7 +382,7 @@ def shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[np
 
 
 def _plan_exposures(settings: SessionSettings, shows: NDArray[np.int64]) -> Exposures:
-    """Of every capture that a slot shows or that has a slot's number."""
+    """Plan exposures for every capture that a slot shows or that shares a slot's index."""
     count = max(settings.frames, int(shows.max()) + 1)
     rng = np.random.default_rng([settings.seed, 6])
     return plan_exposures(settings.exposure_s, settings.auto_exposure, count, settings.fps, rng)
@@ -389,11 +391,11 @@ def _plan_exposures(settings: SessionSettings, shows: NDArray[np.int64]) -> Expo
 def _draw_scene(
     nominal: CameraProfile, true: CameraProfile, motion: HandMotion, settings: SessionSettings, duration_s: float
 ) -> Scene:
-    """Draw a chart that covers all that the motion shows, half a second before and after too.
+    """Draw a chart that covers the field of view over the motion and 0.5 s before and after it.
 
-    The detail that is drawn follows the nominal camera, so a small hidden effect leaves the scene as it is, or a whole
-    multiple of its focal length where the true one is that long.  The lens and the pixels that blur it are the true
-    camera's: one with twice the focal length resolves twice as much of the scene.
+    Its detail follows the nominal focal length, or the whole multiple of it nearest the true one, so a small hidden
+    effect leaves the scene unchanged.  The blur is that of the true camera's lens and pixels: twice the focal length
+    resolves twice as much of the scene.
     """
     lens, true_lens = nominal.intrinsics, true.intrinsics
     if lens is None or true_lens is None:
@@ -420,7 +422,7 @@ def _draw_scene(
 
 
 def _with_things_before(scene: Scene, nominal: CameraProfile, settings: SessionSettings) -> Scene:
-    """The scene with what hangs or moves before it."""
+    """Add the objects in front of the scene and those that move across it."""
     assert nominal.intrinsics is not None
     focal_px = max(nominal.intrinsics.fx_px, nominal.intrinsics.fy_px)
     if settings.near_m is not None:
@@ -435,7 +437,7 @@ def _with_things_before(scene: Scene, nominal: CameraProfile, settings: SessionS
 def _at_median_depth(
     scene: Scene, motion: HandMotion, true: CameraProfile, settings: SessionSettings, shows: NDArray[np.int64]
 ) -> Scene:
-    """Move the plane so that the median over the frames of the distance along the optical axis is its depth."""
+    """Shift the plane so that its median distance along the optical axis, over all frames, equals its depth."""
     exposure = settings.exposure_s[0] * true.shutter.exposure_scale
     times = np.array([_first_row_start_s(true, _stamp_s(int(k), settings.fps), exposure) for k in shows])
     axis = motion.rotation(times).as_matrix()[:, :, 2]
@@ -448,9 +450,9 @@ def _at_median_depth(
 
 
 def _gain(session: Session, slot: int) -> float:
-    """Factor on the light: the capture's exposure × ISO, and the hidden gain of the first slot that shows it.
+    """Factor on the light: relative exposure × ISO times the hidden gain of the capture's first slot.
 
-    The first slot's, so that repeats are exact.
+    The first slot's gain is used so that repeated frames are identical.
     """
     gain = session.true.extensions.gain
     capture = int(session.shows[slot])
@@ -459,7 +461,7 @@ def _gain(session: Session, slot: int) -> float:
 
 
 def _gyro_rate(session: Session, time_s: Array) -> Array:
-    """Rates (n, 3) as the gyroscope passes them on, camera axes."""
+    """Rates (n, 3), camera axes, after the gyroscope's low-pass filters."""
     rate, corners_hz = session.motion.rate_rad_s, _corners_hz(session)
     if not corners_hz:
         return rate(time_s)
@@ -467,7 +469,7 @@ def _gyro_rate(session: Session, time_s: Array) -> Array:
 
 
 def _corners_hz(session: Session) -> list[float]:
-    """Of the hidden low pass, whose delay is in the log, and of the phone's own, whose delay its stamps leave out."""
+    """Corners of the hidden low-pass, whose delay stays in the log, and of the phone's own, whose delay is removed."""
     both = (session.true.extensions.gyro_lowpass_hz, session.settings.isp.gyro_lowpass_hz)
     return [corner_hz for corner_hz in both if corner_hz]
 
@@ -480,7 +482,7 @@ def _gyro_noise(session: Session, shape: tuple[int, ...], rng: np.random.Generat
 
 
 def _grey(session: Session, light: Array) -> Array:
-    """Grey in [0, 1] behind the sensor's curve, highlights rolled off before it."""
+    """Grey in [0, 1]: highlight roll-off, then the response curve."""
     return grey_of_light(roll_off_highlights(light, session.settings.isp.highlights), _curve(session))
 
 

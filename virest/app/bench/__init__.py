@@ -1,1 +1,1 @@
-"""Quality, shutter, speed, growth, memory and command tables: ``python -m virest.app.bench``."""
+"""Benchmarks of quality, accuracy, speed, memory and robustness: ``python -m virest.app.bench``."""

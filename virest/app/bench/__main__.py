@@ -139,7 +139,7 @@ def _version(library: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The checked-out commit of the program, and whether files differ from it."""
+    """Checked-out commit of the program, marked if files differ from it; None outside a git checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -20,23 +20,21 @@ LOGS = ("gyro_accel.csv", "movie_metadata.csv", "frame_timestamps.txt")
 FILLINGS = {"null": "null", "zero": "0", "huge": "1e9", "first": None}
 """Values that replace a column; None: its first value."""
 CUT_PARTS = {"its first tenth": (0.1, 1.0), "its second half": (0.0, 0.5), "its middle": None}
-Way = Callable[[Path], None]
+"""Row ranges to keep, as fractions; None: all but the middle fifth."""
+Defect = Callable[[Path], None]
 
 
 def broken_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Apply every defect to simulated (and available real) captures, and count how each command ends.
-
-    Real captures are used only with --full.
-    """
+    """Apply every defect to simulated captures, with --full also to available real ones, and count the outcomes."""
     sources = [
         simulated(work, "broken-source", width=240, height=320, frames=24, seed=3, rate_rad_s=1.0, exposure_ms=8),
         simulated(work, "broken-rest", width=240, height=320, frames=24, seed=4, rate_rad_s=0.0),
     ]
     sources += _measured() if scale.full else []
     rows = [
-        {"capture": source.name, "broken": name, **ended(work, source, way)}
+        {"capture": source.name, "broken": name, **outcomes(work, source, defect)}
         for source in sources
-        for name, way in ways(source)
+        for name, defect in defects(source)
     ]
     faults = [row for row in rows if "fault" in (row["diagnose"], row["calibrate"])]
     header = ["capture", "broken", "diagnose", "calibrate"]
@@ -53,33 +51,35 @@ def _measured() -> list[Path]:
     return sorted(folder.parent for folder in root.glob("*/movie.mp4"))
 
 
-def ended(work: Path, source: Path, way: Way) -> dict[str, str]:
-    """How diagnose and calibrate end on a broken copy of a capture: a verdict, ``refused`` or ``fault``."""
+def outcomes(work: Path, source: Path, defect: Defect) -> dict[str, str]:
+    """Outcomes of diagnose and calibrate on a broken copy of a capture: a verdict, ``refused`` or ``fault``."""
     folder = work / f"broken-{source.name}"
     shutil.copytree(source, folder, ignore=shutil.ignore_patterns("truth*"))
     try:
-        way(folder)
+        defect(folder)
         output = CalibrationOutput(work / "broken.yaml", overwrite=True)
         found = {
-            "diagnose": _end(lambda: run_diagnosis(str(folder), DiagnosisOptions(work / "out", None, True)).verdict),
-            "calibrate": _end(lambda: str(run_calibration(plan_calibration(folder), output)[0]["verdict"])),
+            "diagnose": _outcome(
+                lambda: run_diagnosis(str(folder), DiagnosisOptions(work / "out", None, True)).verdict
+            ),
+            "calibrate": _outcome(lambda: str(run_calibration(plan_calibration(folder), output)[0]["verdict"])),
         }
     finally:
         shutil.rmtree(folder)
     return found
 
 
-def _end(call: Callable[[], str]) -> str:
+def _outcome(call: Callable[[], str]) -> str:
     try:
         return call()
     except VirestError:
         return "refused"
-    except Exception:  # unexpected exceptions are what this test counts
+    except Exception:  # unexpected exceptions are what this section counts
         traceback.print_exc()
         return "fault"
 
 
-def ways(source: Path) -> Iterator[tuple[str, Way]]:
+def defects(source: Path) -> Iterator[tuple[str, Defect]]:
     """Name of each defect and the function that applies it, for the files of a capture."""
     for log in (source / name for name in LOGS):
         if not log.exists():

@@ -1,12 +1,12 @@
-"""Whether standard deviations are right: calibrate simulated captures and compare errors with standard deviations.
+"""Validity of calibrate's standard deviations σ: errors on simulated captures compared with σ.
 
-Each seed draws the hidden values and the conditions: motion, travel, blur, exposures, noise, bit rate, scene, lens,
-layout.  Seeds below FIRST_SEED are reserved for choosing constants; this command uses others.
+Each seed draws the hidden values and the conditions: motion, translation, blur, exposures, noise, bit rate, scene,
+lens, orientation.  Seeds below FIRST_SEED are reserved for choosing constants.
 
-For each value the table shows median |error| / deviation (0.67 where deviations hold), the part of errors within two
-deviations (0.95), the mean error in deviations, which a bias moves from 0, and a histogram.  "share" is the part of
-a step's noise that is correlated with the value's own pattern, as these captures ask for it (the median would be 0.67)
-and as :data:`virest.inference.tracking_bias.STILL_SHARED` has it.
+For each value the table shows the median |error| / σ (0.67 if σ is right), the fraction of errors within 2 σ (0.95),
+the mean error / σ (0 without bias) and a histogram.  "share" is the fraction of a step's noise that is correlated with
+the value's own pattern: as implied by these captures (the fraction for which the median would be 0.67), and as in
+:data:`virest.inference.tracking_bias.STILL_SHARED`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ BINS = np.array([-np.inf, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, np.inf])
 
 
 def calibration_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Calibrate one capture per seed; draw the histograms into the report's folder, if given."""
+    """Calibrate one capture per seed; draw the histograms into the folder for figures, if given."""
     seeds = QUICK_SEEDS if scale.quick else scale.seeds
     rows = [row for k in range(seeds) for row in calibrated_rows(work, FIRST_SEED + k)]
     names = list(dict.fromkeys(row["value"] for row in rows))
@@ -111,15 +111,15 @@ def errors_of(found: GeometryCalibration, truth: CameraProfile) -> list[Row]:
     """Error and standard deviation of each determined number."""
     rows = []
     for value in found.values:
-        true = _true_value(value, found.profile, truth)
-        if not value.determined or true is None or value.std is None:
+        difference = _error(value, found.profile, truth)
+        if not value.determined or difference is None or value.std is None:
             continue
-        off, std = (np.atleast_1d(np.asarray(v, float)) for v in (true, value.std))
+        errors, stds = (np.atleast_1d(np.asarray(v, float)) for v in (difference, value.std))
         name, unit = _TERMS[value.name]
         shared = unit(found.profile) * shared_std(found.fit, name)
-        for k, (error, deviation) in enumerate(zip(off, std, strict=True)):
-            rows.append({"value": value.name, "component": k, "error": float(error), "std": float(deviation),
-                         "shared_std": float(shared[k]), "error_in_std": float(error / deviation)})  # fmt: skip
+        for k, (error, std) in enumerate(zip(errors, stds, strict=True)):
+            rows.append({"value": value.name, "component": k, "error": float(error), "std": float(std),
+                         "shared_std": float(shared[k]), "error_in_std": float(error / std)})  # fmt: skip
     return rows
 
 
@@ -133,11 +133,11 @@ _TERMS: dict[str, tuple[str, Callable[[CameraProfile], float]]] = {
     "principal_point_px": ("principal_point", lambda _: 1.0),
     "exposure_scale": ("exposure_time", lambda p: p.shutter.exposure_scale),
 }
-"""Each value's term, and the value's unit in the term's."""
+"""Term of each value, and the factor from the term's unit to the value's."""
 
 
-def _true_value(value: CalibratedValue, found: CameraProfile, truth: CameraProfile) -> Array | None:
-    """Found − true, (k,); None for a word."""
+def _error(value: CalibratedValue, found: CameraProfile, truth: CameraProfile) -> Array | None:
+    """Error (k,) of a value, found − true; None for a word."""
     lens, true_lens = found.intrinsics, truth.intrinsics
     assert lens is not None
     assert true_lens is not None
@@ -164,23 +164,23 @@ def _true_value(value: CalibratedValue, found: CameraProfile, truth: CameraProfi
 
 
 def summed(rows: Sequence[Row]) -> dict[str, Any]:
-    """Statistics of one value's errors in standard deviations, and the shared noise that its errors imply."""
-    known = np.array([row["error_in_std"] for row in rows])
+    """Statistics of one value's errors in standard deviations, and the shared fraction of the noise that they imply."""
+    errors = np.array([row["error_in_std"] for row in rows])
     name = _TERMS[rows[0]["value"]][0]
     in_use = STILL_SHARED.get(name, STILL_SHARED_OTHER)
     return {
-        "count": len(known),
-        "median": float(np.median(np.abs(known))),
-        "within_two": float(np.mean(np.abs(known) < 2)),
-        "mean": float(known.mean()),
-        "share_asked": in_use * _factor_asked(rows),
+        "count": len(errors),
+        "median": float(np.median(np.abs(errors))),
+        "within_two": float(np.mean(np.abs(errors) < 2)),
+        "mean": float(errors.mean()),
+        "share_asked": in_use * _implied_factor(rows),
         "share_in_use": in_use,
-        "histogram": np.histogram(known, BINS)[0].tolist(),
+        "histogram": np.histogram(errors, BINS)[0].tolist(),
     }
 
 
-def _factor_asked(rows: Sequence[Row]) -> float:
-    """Factor on the shared part of the noise that would bring the median |error| / deviation to its normal value."""
+def _implied_factor(rows: Sequence[Row]) -> float:
+    """Factor on the shared standard deviation for which the median |error| / σ would be USUAL_MEDIAN."""
     error, std, shared = (np.array([row[key] for row in rows]) for key in ("error", "std", "shared_std"))
     rest = np.maximum(std**2 - shared**2, 0.0)
     factors = np.linspace(0.0, 4.0, 401)

@@ -1,10 +1,10 @@
-"""How far video coding pulls points to the motion of the blocks above and left (:mod:`virest.inference.coded_motion`).
+"""Bias of tracked points towards the motion of neighbouring coding blocks (:mod:`virest.inference.coded_motion`).
 
 $ python -m virest.app.bench --only coding --quick
 
-Captures without any model error, with four motions and contents, are read in all four directions and coded at three bit
-rates.  Measured, each fitted alone: the errors of the time offset and of the principal point from their points, and the
-coding errors of a step, divided by the square of its noise, that these imply: by rows, and at one instant.
+Captures without model errors, of four scenes and motions, are read out in all four directions and coded at three bit
+rates.  The time offset and the principal point are each fitted alone.  Their errors imply a coding error of a step,
+divided by the square of its noise: by rows, and at one instant.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FIRST_SEED, FRAMES, MOST_POINTS = 9101, 84, 7000
 
 
 def coding_section(work: Path, scale: Scale) -> tuple[Row, str]:
-    """Measure captures of all scenes with every readout direction and bit rate; quick: of one scene."""
+    """Measure all scenes (one with --quick) at every readout direction and bit rate."""
     scenes = list(enumerate(SCENES))[:: len(SCENES) if scale.quick else 1]
     rows = [_row(work, *one) for one in product(scenes, READOUT_DIRECTIONS, BITS_PER_PX)]
     return {"captures": rows}, _text(rows)
@@ -99,6 +99,6 @@ def _text(rows: list[Row]) -> str:
 
 
 def _asked(rows: list[Row], kind: str) -> str:
-    """Mean and rms of the coding errors that captures imply."""
+    """Mean and RMS of the coding errors implied by the captures."""
     asked = np.array([row[kind] for row in rows])
     return f"{asked.mean():+.1f} {np.sqrt(np.mean(asked**2)):.1f}"

@@ -1,4 +1,4 @@
-"""The time of interactive commands: ``--help``, ``inspect``, ``calibrate`` and ``diagnose``.
+"""Run time of interactive commands: ``--help``, ``inspect``, ``calibrate`` and ``diagnose``.
 
 $ python -m virest.app.bench --only commands --quick
 """
@@ -15,7 +15,7 @@ from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, Timing, looped_capture, simulated, timed
 
 HELP_TRIES, INSPECT_TRIES = 5, 2
-"""Number of runs, of which the fastest counts; one run before fills the system's caches."""
+"""Number of runs, of which the fastest counts; before ``--help`` one extra run fills the system's caches."""
 INSPECTED_FRAMES = 18_000
 """10 min at 30 frames/s."""
 FITTED_FRAMES, FPS = 960, 30.0
@@ -28,14 +28,14 @@ HIDDEN = (
     "response_curve=1.3",
     "vignetting=0.5",
 )
-"""Effects hidden in the full-size captures; not with --quick, since these take about 10 min to simulate."""
+"""Effects hidden in the phone-size capture, which is left out with --quick since it takes about 10 min to simulate."""
 HELP_S, INSPECT_S = 0.3, 5.0
-"""Limits of the first two commands; for the others the limit is the capture's duration."""
+"""Time limits of ``--help`` and ``inspect``; for the others the limit is the capture's duration."""
 Facts = dict[str, Any]
 
 
 def commands_section(work: Path, scale: Scale) -> tuple[Facts, str]:
-    """Time each command as a separate process, from start to end."""
+    """Time each command as a separate process, from start to exit."""
     rows = [_help(), _inspect(work), *_fits(work, QUICK_SIZE if scale.quick else SIZE)]
     rows += [] if scale.quick else _fits(work, PHONE_SIZE, HIDDEN)
     return {"commands": rows}, commands_text(rows)
@@ -87,7 +87,7 @@ def _fits(work: Path, size: tuple[int, int], hidden: tuple[str, ...] = ()) -> li
 
 
 def record(name: str, title: str, tries: list[Timing], asked_s: float) -> Facts:
-    """The time of the fastest run, and its fraction of the limit."""
+    """Time of the fastest run, and its fraction of the limit."""
     best = min(tries, key=lambda timing: timing.wall_s)
     return {
         "command": name,

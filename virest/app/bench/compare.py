@@ -1,4 +1,4 @@
-"""Compare two bench.json: every figure in both, new over old, and which changes exceed the noise.
+"""Compare two bench.json files: every common figure, new over old, and which changes exceed the noise.
 
 $ python -m virest.app.bench --compare OLD.json NEW.json
 """
@@ -32,12 +32,12 @@ NAMES = (
 )
 """Keys that identify a record of a list; others are identified by a numeric ``frame`` or ``frames``."""
 NOISE = 0.15
-"""Relative change below which two timings on one quiet machine may be the same."""
+"""Relative change up to which two timings on one quiet machine may be equal."""
 MEMORY_NOISE = 0.05
 NOISE_DB = 0.05
-"""Absolute, since gains in dB do not depend on the machine's load, and a ratio of gains is meaningless near zero."""
+"""Absolute change in dB: gains do not depend on the machine's load, and their ratio is meaningless near zero."""
 BUSY_CORES = 0.25
-"""Above this, wall-clock times are unreliable."""
+"""Load by other processes above which wall-clock times are unreliable."""
 MORE_IS_BETTER = ("frames_per_s", "_db", "share_of_floor", "share_of_floor_by_cpu", "share_of_floor_by_stages",
                   "frames_per_s_by_cpu", "scaling", "scaling_by_cpu",
                   "right", "good_done", "cores_that_fill_the_link")  # fmt: skip
@@ -45,9 +45,9 @@ LESS_IS_BETTER = ("_s", "_mb", "s_per_frame", "cpu_s_per_frame", "part_of_asked"
                   "wall_exponent", "estimate_share", "estimate_share_with_planning", "grown", "dollars",
                   "core_hours", "straightened_median_px", "straightened_p90_px", "promise_off", "worse_share",
                   "promised_and_worse")  # fmt: skip
-"""Last meaningful part of a figure's path; with a leading underscore, its ending."""
+"""Last meaningful part of a figure's path; with a leading underscore, a suffix of it."""
 NO_FIGURES = ("load", "others_cores", "busiest_others_cores", "asked_s", "exit_code")
-"""Facts about the machine or the settings, which are reported elsewhere."""
+"""Keys that describe the machine or the settings and are not compared as figures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +76,13 @@ def read_report(path: Path) -> Report:
 
 
 def compared(old: Report, new: Report, noise: float = NOISE) -> list[Change]:
-    """All common figures, in the new report's order."""
+    """All common figures, in the order of the new report."""
     before, after = dict(figures(old)), dict(figures(new))
     return [Change(n, before[n], v, _mark(n, before[n], v, noise)) for n, v in after.items() if n in before]
 
 
 def compare_text(old: Report, new: Report, noise: float = NOISE) -> str:
-    """Differences of machines and versions, then every figure, then the sections of only one report."""
+    """Differences of machines and versions, then all common figures, then sections in only one report."""
     changes = compared(old, new, noise)
     rows = [[c.name, f"{c.old:.6g}", f"{c.new:.6g}", _ratio_text(c), c.mark] for c in changes]
     flagged = sum(bool(change.mark) for change in changes)
@@ -142,7 +142,7 @@ def _only_one(old: Report, new: Report) -> list[str]:
 
 
 def figures(report: Report) -> Iterator[tuple[str, float]]:
-    """(path, number) of every figure of the sections."""
+    """(path, value) of every figure in the sections."""
     for section, facts in report.items():
         if section != "versions" and isinstance(facts, dict):
             yield from _leaves(section, facts)
@@ -161,7 +161,7 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, float]]:
 
 
 def _identity(record: Any, position: int) -> str:
-    """The identity of a record, so that lists may grow or change order; else its position."""
+    """Identity of a record, so that lists may grow or change order; its position if it has none."""
     if not isinstance(record, dict):
         return str(position)
     words = [str(record[key]) for key in NAMES if isinstance(record.get(key), str | int | None) and key in record]
@@ -170,7 +170,7 @@ def _identity(record: Any, position: int) -> str:
 
 
 def _mark(name: str, old: float, new: float, noise: float) -> str:
-    """Whether a figure changed by more than its noise, and for the better or the worse."""
+    """Whether a figure changed by more than its noise, and whether for better or worse."""
     if "_db" in name:
         beyond = abs(new - old) > NOISE_DB
     else:

@@ -1,4 +1,4 @@
-"""The cost of 10,000 captures of 5 min, from the CPU times of the section ``speed``.
+"""Cost of processing 10,000 captures of 5 min, from the CPU times of the section ``speed``.
 
 $ python -m virest.app.bench --only speed --only cost
 """
@@ -16,11 +16,11 @@ from virest.app.bench.workload import Scale, looped_capture, run_process
 
 CAPTURES, MINUTES, FPS = 10_000, 5, 30
 DOLLARS_PER_CORE_HOUR = 0.04
-"""Assumption: a rented core with 4 GB, on demand; spot prices are 1/3."""
+"""Assumption: a rented core with 4 GB, on demand; spot prices are a third."""
 DOLLARS_PER_TB_MONTH = 23.0
 """Assumption: object storage."""
 LINK_GBIT_S = 10.0
-"""Assumption: bandwidth of writing to the storage."""
+"""Assumption: write bandwidth of the storage."""
 SAMPLE_FRAMES = 30
 
 
@@ -37,7 +37,7 @@ def cost_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def _measured(path: Path) -> dict[str, float]:
-    """Frames per second of each preset with JOBS processes, by CPU time, since core hours are paid."""
+    """Frames per second of each preset with JOBS processes, by CPU time, since core hours are billed."""
     if not path.is_file():
         return {}
     report = json.loads(path.read_text(encoding="utf-8"))

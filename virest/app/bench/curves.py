@@ -1,7 +1,7 @@
-"""The value of the exposure curve: the same frames restored with the right curve, none, and wrong ones.
+"""Benefit of the response curve: the same frames restored with the right curve, none, and wrong ones.
 
-Everything but the curve is known and equal, so PSNR against truth differs only by the curve.  The last table measures
-the value of masking clipped pixels: with the curve's clipping mask, without it, and in a capture without clipping.
+Everything but the curve is known and equal, so differences in PSNR against truth are due to the curve.  A second table
+measures the benefit of masking clipped pixels: with the curve's clipping mask, without it, and without clipping.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import PRESETS, RestorationSettings
 
 FINE_BITS = 1.0
-"""Bits per pixel; high, so that coding loss does not mask the effect of the curve."""
+"""Bits per pixel, high enough that coding loss does not mask the effect of the curve."""
 BASE: dict[str, Any] = {"width": 640, "height": 480, "exposure_ms": 16.0, "rate_rad_s": 1.4, "noise_levels": 1.0,
                         "bitrate_bits_per_px": FINE_BITS}  # fmt: skip
 SEEDS = (11, 12, 13)
 GAMMA, LINEAR, SRGB = ResponseCurve("gamma", gamma=2.2), ResponseCurve("linear"), ResponseCurve("srgb")
 BENT = ResponseCurve("five_segment", b=(0.065, 0.048), c=(0.4, 0.6), y_max=1.0)
-"""With dead leaves, toe and shoulder together hold about 1/5 of the pixels."""
+"""With dead leaves, toe and shoulder together hold about 20 % of the pixels."""
 OTHER_KNOTS = ResponseCurve("five_segment", b=(0.12, 0.14), c=(0.62, 0.88), y_max=1.0)
 CURVES: dict[str, tuple[ResponseCurve, dict[str, ResponseCurve]]] = {
     "gamma 2.2": (GAMMA, {"none (linear)": LINEAR, "gamma 1.2": ResponseCurve("gamma", gamma=1.2),
                           "gamma 1 / 2.2": ResponseCurve("gamma", gamma=1 / 2.2)}),
     "toe and shoulder": (BENT, {"none (linear)": LINEAR, "other knots": OTHER_KNOTS, "srgb": SRGB}),
 }  # fmt: skip
-"""The camera's curve, and the other curves that the restoration uses."""
+"""The camera's curve, and the wrong curves used for restoration."""
 CODED_PX = 8
-"""Block size of the codec, over which it spreads its errors."""
+"""Transform block size of the codec, over which coding errors spread."""
 Mask = NDArray[np.bool_]
 
 
@@ -75,11 +75,11 @@ def curves_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def curve_rows(work: Path, name: str, seeds: tuple[int, ...], frames: int) -> list[dict[str, Any]]:
-    """PSNR of every frame with the camera's own curve and with others, one record per curve."""
+    """PSNR of all frames with the camera's own curve and with others, one record per curve."""
     true, others = CURVES[name]
     captures = [_capture(work, f"{name}-{seed}", response=true, seed=seed, frames=frames) for seed in seeds]
-    told = {"right": true, **others}
-    found = {t: np.concatenate([_psnrs_db(c, curve) for c in captures]) for t, curve in told.items()}
+    used = {"right": true, **others}
+    found = {t: np.concatenate([_psnrs_db(c, curve) for c in captures]) for t, curve in used.items()}
     plain = np.concatenate([_psnrs_db(c, true, deblur="none") for c in captures])
     ends = tuple(round(float(share), 3) for share in np.mean([end_shares(c, true) for c in captures], axis=0))
     return [
@@ -97,7 +97,7 @@ def curve_rows(work: Path, name: str, seeds: tuple[int, ...], frames: int) -> li
 
 
 def end_shares(capture: Path, curve: ResponseCurve) -> tuple[float, float]:
-    """Share of a capture's first truth picture in the curve's toe (below B) and in its shoulder (above C)."""
+    """Fraction of the first truth frame in the curve's toe (below B) and in its shoulder (above C)."""
     truth = truth_frame(capture, 0).astype(np.float64) / 255
     if curve.kind != "five_segment":
         return 0.0, 0.0
@@ -109,7 +109,7 @@ def _capture(work: Path, name: str, **options: Any) -> Path:
 
 
 def _psnrs_db(capture: Path, curve: ResponseCurve, deblur: str | None = None) -> NDArray[np.float64]:
-    """PSNR of each frame inside its valid rectangle less a margin, (frames,)."""
+    """PSNR (frames,) of each frame inside its valid rectangle less a margin."""
     results = [(r, truth_frame(capture, r.frame.index)) for r in restored(capture, curve, deblur)]
     return np.array([masked_psnr_db(r.picture, truth, inside(r, truth.shape)) for r, truth in results])
 
@@ -117,7 +117,7 @@ def _psnrs_db(capture: Path, curve: ResponseCurve, deblur: str | None = None) ->
 def restored(capture: Path, curve: ResponseCurve, deblur: str | None = None) -> list[RestoredFrame]:
     """All frames of a capture restored with preset balanced and ``curve`` as the camera's curve.
 
-    Each frame is restored alone: near clipped highlights neighbours are not used, and only the masks are compared.
+    Each frame is restored alone, since neighbours are not used near clipped highlights and only masks are compared.
     """
     recorded = read_capture(capture)
     settings: RestorationSettings = replace(PRESETS["balanced"], neighbours=0)
@@ -146,13 +146,13 @@ def masked_psnr_db(picture: Picture | None, truth: Picture, mask: Mask) -> float
 
 
 CLIPPING = ("sunlit", "lamps")
-"""Leaves exposed so that CLIPPED_SHARE of the pixels clips; leaves with lights and glints 2 to 12 times too bright on
+"""Leaves exposed so that CLIPPED_SHARE of the pixels clip; leaves with highlights of up to 12 times the clip level on
 about 3 % of the area."""
 CLIPPED_SHARE = 0.03
 
 
 def clipping_rows(work: Path, name: str, seeds: tuple[int, ...], frames: int) -> list[dict[str, Any]]:
-    """PSNR near clipped highlights and elsewhere: with the mask, without, and for the capture without clipping."""
+    """PSNR near clipped highlights and elsewhere: with the mask, without it, and for the capture without clipping."""
     pairs = [_clipping_pair(work, name, seed, frames) for seed in seeds]
     readers: dict[str, Callable[[Path, Path, float], list[RestoredFrame]]] = {
         "with the mask": lambda clipped, _less, _gain: restored(clipped, GAMMA),
@@ -164,14 +164,17 @@ def clipping_rows(work: Path, name: str, seeds: tuple[int, ...], frames: int) ->
     for reader, read in readers.items():
         found = np.array([f for pair in pairs for f in _near_and_far(read(*pair), pair[0])])
         near, far, whole, share = found.mean(axis=0).tolist()
-        alike = reader != "nothing clipped"
+        comparable = reader != "nothing clipped"
         rows.append({"scene": name, "told": reader, "clipped": share, "elsewhere_db": far,
-                     "near_db": near if alike else None, "whole_db": whole if alike else None})  # fmt: skip
+                     "near_db": near if comparable else None, "whole_db": whole if comparable else None})  # fmt: skip
     return rows
 
 
 def _clipping_pair(work: Path, name: str, seed: int, frames: int) -> tuple[Path, Path, float]:
-    """(clipped, nothing clipped, how much brighter the first is): one scene and motion, and one noise in its light."""
+    """Captures (clipped, unclipped) and the exposure ratio of the first to the second.
+
+    Both have the same motion and, for ``sunlit``, the same scene and the same noise relative to light.
+    """
     options = {"response": GAMMA, "seed": seed, "frames": frames}
     less = _capture(work, f"less-{seed}", **options)
     if name == "lamps":
@@ -184,14 +187,14 @@ def _clipping_pair(work: Path, name: str, seed: int, frames: int) -> tuple[Path,
 
 
 def _exposed_up(results: list[RestoredFrame], gain: float) -> list[RestoredFrame]:
-    """Pictures of less light as the clipped exposure would have shown them."""
+    """Raise the exposure of restored frames to that of the clipped capture."""
     light = GAMMA.linear_table().astype(np.float64) * gain
     table = np.clip(np.rint(255 * GAMMA.encode(light)), 0, 255).astype(np.uint8)
     return [replace(r, picture=None if r.picture is None else table[r.picture]) for r in results]
 
 
 def _near_and_far(results: list[RestoredFrame], clipped: Path) -> list[list[float]]:
-    """For each frame: PSNR within a blur path of clipped highlights, farther away, and overall; the clipped share."""
+    """Per frame: PSNR within a blur path of clipped highlights, elsewhere, and overall; fraction of clipped pixels."""
     found: list[list[float]] = []
     for result in results:
         truth = truth_frame(clipped, result.frame.index)

@@ -1,6 +1,6 @@
-"""Hide one effect, diagnose, compare: every effect, several seeds, both layouts, and captures without effects.
+"""Accuracy of diagnose: captures with one hidden effect (every effect, several seeds) and captures without any.
 
-The diagnosis reads only the capture's folder; the hidden effect is stated in truth/.
+The diagnosis reads only the capture folder; the hidden effect is stated in truth/.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Case = tuple[str, int]
 
 
 def diagnosis_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Diagnose a capture for each effect and seed, and 1/4 as many captures without effects."""
+    """Diagnose one capture per effect and seed, and a quarter as many captures without effects."""
     seeds = SEEDS["quick" if scale.quick else "full" if scale.full else "normal"]
     cases: list[Case] = [(name, 100 * k + i) for k in range(seeds) for i, name in enumerate(CATALOGUE)]
     cases += [("", 9000 + k) for k in range(max(len(cases) // 4, 2))]
@@ -46,7 +46,7 @@ def diagnosis_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def diagnose_hidden(work: Path, name: str, seed: int) -> dict[str, Any]:
-    """Simulate with one effect of random size (none for an empty name), diagnose, compare with the truth."""
+    """Simulate one effect of random size (none for an empty name), diagnose, and compare with the truth."""
     rng = np.random.default_rng([seed, 77])
     width, height = (480, 640) if seed % 2 else (640, 480)
     folder = work / f"{name or 'null'}_{seed}"

@@ -1,4 +1,4 @@
-"""What edges reveal: the phone's sharpening or its absence (:mod:`unsharp_mask`), and defocus.
+"""Detection of sharpening (:mod:`virest.inference.unsharp_mask`) and defocus from edges.
 
 $ python -m virest.app.bench --only edges --quick
 """
@@ -27,16 +27,16 @@ Row = dict[str, Any]
 SCENES = ("leaves", "text", "board", "bright", "photographs")
 SIZES = ((320, 240), (640, 480))
 MOTIONS = ((0.4, 6.0), (0.6, 8.0), (1.2, 12.0))
-"""Rotation rate in rad/s and exposure in ms."""
+"""RMS angular rate in rad/s and exposure in ms."""
 MASKS = ((0.0, 1.0), (0.4, 1.0), (0.7, 1.0), (1.0, 1.5))
-"""Amount and radius; the first entry is no sharpening."""
+"""Amount and radius in px of the unsharp mask; the first entry is no sharpening."""
 FRAMES, FIRST_SEED = 6, 7000
 DEFOCUS_PX, SOFT_SCENES = (2.0, 2.5, 3.0, 3.5), ("leaves", "text", "board", "photographs")
 SOFT_FRAMES, FIRST_SOFT_SEED = 60, 7200
 
 
 def edges_section(work: Path, scale: Scale) -> tuple[Row, str]:
-    """Measure captures of all scenes, sizes and motions, each with every mask."""
+    """Measure all scenes, sizes and motions with every mask, and captures with defocus."""
     every = list(product(SCENES, SIZES, MOTIONS))[:: 4 if scale.quick else 1]
     groups = [[_row(work, number, *one, mask) for number, one in enumerate(every)] for mask in MASKS]
     softened = list(enumerate(product(DEFOCUS_PX, SOFT_SCENES)))[:: 5 if scale.quick else 1]
@@ -70,7 +70,7 @@ def _row(
 
 
 def _soft_row(work: Path, number: int, hidden: tuple[float, str]) -> Row:
-    """Fit the defocus of one capture, its only model error, to its edges."""
+    """Fit the defocus of one capture, its only model error, from its edges."""
     sigma_px, scene = hidden
     rng = np.random.default_rng([FIRST_SOFT_SEED, number])
     capture = simulated(
@@ -84,25 +84,25 @@ def _soft_row(work: Path, number: int, hidden: tuple[float, str]) -> Row:
     seen = look_for_blur(source.gray, source.capture, source.profile, trajectory)
     effects: list[Any] = [Defocus()]
     found = fit(seen, source.profile, trajectory, effects)
-    told = {"told_px": float(found.values[0][0]), "std_px": float(found.std[0])} if found.determined[0] else {}
-    return {"scene": scene, "sigma_px": sigma_px, "edges": len(seen.edges), **told}
+    estimate = {"told_px": float(found.values[0][0]), "std_px": float(found.std[0])} if found.determined[0] else {}
+    return {"scene": scene, "sigma_px": sigma_px, "edges": len(seen.edges), **estimate}
 
 
 def _soft_text(rows: list[Row]) -> str:
-    told = [row for row in rows if "told_px" in row]
+    estimated = [row for row in rows if "told_px" in row]
     lines = [
         [f"{row['sigma_px']:g}", row["scene"], str(row["edges"]), f"{row['told_px']:.2f} ± {row['std_px']:.2f}"]
-        for row in told
+        for row in estimated
     ]
-    off = np.array([row["told_px"] / row["sigma_px"] - 1 for row in told])
+    off = np.array([row["told_px"] / row["sigma_px"] - 1 for row in estimated])
     return (
         f"DEFOCUS, px: relative error {np.mean(off):+.3f} in the mean, rms {np.sqrt(np.mean(off**2)):.3f},\n"
-        f"in {len(told)} of {len(rows)} captures\n" + table(["hidden", "scene", "edges", "estimated"], lines)
+        f"in {len(estimated)} of {len(rows)} captures\n" + table(["hidden", "scene", "edges", "estimated"], lines)
     )
 
 
 def _overshoot(capture: Path) -> Overshoot | None:
-    """Overshoot in the least blurred frames, as planning measures it."""
+    """Overshoot in the MOST_FRAMES least blurred frames, measured as in the planning of a restoration."""
     source = open_source(capture)
     trajectory = integrate_gyro(source.capture.imu, source.profile)
     lens = moving_lens(trajectory, source.profile)
@@ -110,8 +110,8 @@ def _overshoot(capture: Path) -> Overshoot | None:
         moved_over_frame(trajectory, lens, frame, "exposure-start", None, source.profile)
         for frame in source.capture.frames
     ]
-    calmest = sorted(range(len(motions)), key=lambda n: path_length_px(motions[n]))[:MOST_FRAMES]
-    grey = source.gray(sorted(calmest))
+    least_blurred = sorted(range(len(motions)), key=lambda n: path_length_px(motions[n]))[:MOST_FRAMES]
+    grey = source.gray(sorted(least_blurred))
     return overshoot([(picture, motions[n]) for n, picture in grey if picture is not None])
 
 
@@ -129,21 +129,21 @@ def _text(groups: list[list[Row]]) -> str:
     ]
     lines = []
     for rows in groups:
-        told = [row for row in rows if row["p_value"] is not None]
-        seen = [row for row in told if row["p_value"] < FALSE_ALARM]
-        every, sharpest = (np.array([row[key] for row in told]) for key in ("of_all", "of_sharpest"))
-        fitted = np.array([row["fitted"] for row in (told if rows[0]["mask"][0] else seen)]).reshape(-1, 2)
+        measured = [row for row in rows if row["p_value"] is not None]
+        seen = [row for row in measured if row["p_value"] < FALSE_ALARM]
+        every, sharpest = (np.array([row[key] for row in measured]) for key in ("of_all", "of_sharpest"))
+        fitted = np.array([row["fitted"] for row in (measured if rows[0]["mask"][0] else seen)]).reshape(-1, 2)
         lines.append(
             [
                 f"{rows[0]['mask'][0]:g}, {rows[0]['mask'][1]:g} px" if rows[0]["mask"][0] else "none",
-                str(len(told)),
-                _spread(every, 4),
-                _spread(sharpest, 4),
+                str(len(measured)),
+                _mean_and_std(every, 4),
+                _mean_and_std(sharpest, 4),
                 f"{sharpest.max():.3f}",
-                f"{len(seen)} of {len(told)}",
-                _spread(fitted[:, 0], 2),
-                _spread(fitted[:, 1], 2),
-                _spread([row["expected"] for row in told], 2),
+                f"{len(seen)} of {len(measured)}",
+                _mean_and_std(fitted[:, 0], 2),
+                _mean_and_std(fitted[:, 1], 2),
+                _mean_and_std([row["expected"] for row in measured], 2),
             ]
         )
     return (
@@ -153,5 +153,5 @@ def _text(groups: list[list[Row]]) -> str:
     )
 
 
-def _spread(values: Any, digits: int) -> str:
+def _mean_and_std(values: Any, digits: int) -> str:
     return f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f}" if len(values) else "-"

@@ -1,6 +1,6 @@
-"""Hide an effect outside the catalogue, diagnose, and apply the result: to frames, and to another capture.
+"""Accuracy of diagnose on effects outside the catalogue, and benefit of its result on frames and on another capture.
 
-The diagnosis reads only the capture's folder.  Sign and size (weak, strong) of the effect come from the case's seed.
+The diagnosis reads only the capture folder.  The seed of a case determines sign and size (weak, strong) of the effect.
 """
 
 from __future__ import annotations
@@ -34,35 +34,35 @@ from virest.simulation.session import SessionSettings, nominal_camera, plan_sess
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
-Draw = Callable[[np.random.Generator, float], "Strangeness"]
+Draw = Callable[[np.random.Generator, float], "UnknownEffect"]
 SIZE, SMALL, FPS = (640, 480), (480, 360), 30.0
-"""First seeds of captures with an unknown effect, and of captures without."""
 FRAMES, FRAMES_OF_OTHER = 96, 50
 FIRST_SEED, FIRST_NULL = 7100, 8100
+"""First seeds of captures with and without an unknown effect."""
 SEEDS = {"quick": 1, "usual": 2, "full": 6}
 NULLS = {"quick": 4, "usual": 16, "full": 50}
 SCENES = ("leaves", "text", "board", "bright", "photographs")
 SOLVED = 0.8
-"""Fraction of the excess residual that a correct field must remove."""
-PRESET, LOOKED_AT, HARM_DB = "balanced", "8:96:16", 0.1
-"""Settings and frames of the restorations with and without the result, and the loss in dB that counts as harm."""
+"""Minimum fraction of the excess residual (squared) that a correct field removes in another capture."""
+PRESET, RESTORED_FRAMES, HARM_DB = "balanced", "8:96:16", 0.1
+"""Preset and frames of the restorations with and without the result, and the change in dB that counts."""
 
 
 @dataclass(frozen=True, slots=True)
-class Strangeness:
-    """The unknown effect of a phone, and the diagnosis that is expected."""
+class UnknownEffect:
+    """A phone's effect outside the catalogue, and the expected diagnosis."""
 
     hidden: Hidden = NOTHING
     tangential: tuple[float, float] = (0.0, 0.0)
-    """p1 and p2 of the lens."""
+    """Tangential distortion p1, p2."""
     effects: tuple[str, ...] = ()
-    """Catalogue effects with their values."""
+    """Catalogue effects, with or without values."""
     expected: tuple[frozenset[tuple[str, str]], ...] = ()
-    """Per field: the acceptable kinds and covariates."""
+    """Per field: acceptable pairs of kind and covariates."""
     lasting: bool = True
-    """Whether other captures of the phone have it too."""
+    """Whether other captures of the phone share the effect."""
     nameless: bool = False
-    """Whether no cause and no form describes it: then only an unnamed result is right."""
+    """Whether neither a cause nor a field describes it, so that only an unnamed result is right."""
 
 
 def _either(*pairs: tuple[str, str]) -> frozenset[tuple[str, str]]:
@@ -76,7 +76,7 @@ def _sign(rng: np.random.Generator) -> float:
     return float(rng.choice((-1.0, 1.0)))
 
 
-def _uneven(rng: np.random.Generator, size: float) -> Strangeness:
+def _uneven(rng: np.random.Generator, size: float) -> UnknownEffect:
     """Row delays: a parabola, a wave, or two blocks with a pause between them."""
     late_s, kind = _sign(rng) * size * 1.1e-3 * rng.uniform(0.8, 1.25), int(rng.integers(3))
     pause = float(rng.uniform(0.3, 0.7))
@@ -86,27 +86,27 @@ def _uneven(rng: np.random.Generator, size: float) -> Strangeness:
         block = np.clip((fraction - pause) / 0.04, 0, 1) - fraction
         return np.asarray(late_s * (4 * fraction * (1 - fraction), wave, 1.6 * block)[kind])
 
-    return Strangeness(Hidden(row_delay_s=delay_s), expected=(_either(("delay", "row")),))
+    return UnknownEffect(Hidden(row_delay_s=delay_s), expected=(_either(("delay", "row")),))
 
 
-def _tangential(rng: np.random.Generator, size: float) -> Strangeness:
+def _tangential(rng: np.random.Generator, size: float) -> UnknownEffect:
     turn = rng.uniform(0, 2 * np.pi)
     p = 0.006 * size * rng.uniform(0.8, 1.25)
     lens = (float(p * np.cos(turn)), float(p * np.sin(turn)))
-    return Strangeness(tangential=lens, expected=(_either(("displacement", "x, y")),))
+    return UnknownEffect(tangential=lens, expected=(_either(("displacement", "x, y")),))
 
 
-def _clipping(rng: np.random.Generator, size: float) -> Strangeness:
+def _clipping(rng: np.random.Generator, size: float) -> UnknownEffect:
     part = float(np.clip(0.72 - 0.1 * size + rng.uniform(-0.04, 0.04), 0.3, 0.9))
 
     def clipped(_time: Array, reading: Array, _force: Array) -> Array:
         limit = part * np.abs(reading).max()
         return np.clip(reading, -limit, limit)
 
-    return Strangeness(Hidden(gyro=clipped), expected=(_either(("inertial_rows", "rate")),), lasting=False)
+    return UnknownEffect(Hidden(gyro=clipped), expected=(_either(("inertial_rows", "rate")),), lasting=False)
 
 
-def _gap(rng: np.random.Generator, size: float) -> Strangeness:
+def _gap(rng: np.random.Generator, size: float) -> UnknownEffect:
     from_s, lasting_s = rng.uniform(0.6, 1.9), rng.uniform(0.07, 0.1) * (1 + size)
 
     def filled(time_s: Array, reading: Array, _force: Array) -> Array:
@@ -115,11 +115,11 @@ def _gap(rng: np.random.Generator, size: float) -> Strangeness:
         reading[inside] = np.linspace(reading[inside[0]], reading[inside[-1]], len(inside))
         return reading
 
-    return Strangeness(Hidden(gyro=filled), expected=(_either(("inertial_rows", "time")),), lasting=False)
+    return UnknownEffect(Hidden(gyro=filled), expected=(_either(("inertial_rows", "time")),), lasting=False)
 
 
-def _breathing(rng: np.random.Generator, size: float) -> Strangeness:
-    """The focus oscillates, and the focal length with it."""
+def _breathing(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """The focus moves to a near object and back, and the focal length changes with it."""
     per_dioptre = _sign(rng) * 0.006 * size * rng.uniform(0.8, 1.25)
     far, near = rng.uniform(0.2, 0.8), rng.uniform(2.0, 3.5)
     there_s, back_s = rng.uniform(0.6, 1.1), rng.uniform(1.9, 2.5)
@@ -129,35 +129,35 @@ def _breathing(rng: np.random.Generator, size: float) -> Strangeness:
         return np.asarray(far + (near - far) * rise)
 
     hidden = Hidden(focal_scale=lambda t: 1 + per_dioptre * (dioptres(t) - far), focus_dioptres=dioptres)
-    return Strangeness(hidden, expected=(_either(("scale", "focus")),))
+    return UnknownEffect(hidden, expected=(_either(("scale", "focus")),))
 
 
-def _thermal(rng: np.random.Generator, size: float) -> Strangeness:
+def _thermal(rng: np.random.Generator, size: float) -> UnknownEffect:
     part, settling_s = _sign(rng) * 0.010 * size * rng.uniform(0.8, 1.25), rng.uniform(0.4, 0.8)
     hidden = Hidden(focal_scale=lambda t: 1 + part * (1 - np.exp(-np.maximum(t, 0) / settling_s)))
-    return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
+    return UnknownEffect(hidden, expected=(_either(("scale", "time")),), lasting=False)
 
 
-def _g_sensitivity(rng: np.random.Generator, size: float) -> Strangeness:
+def _g_sensitivity(rng: np.random.Generator, size: float) -> UnknownEffect:
     per_force = 0.003 * size * rng.normal(size=(3, 3))
     hidden = Hidden(gyro=lambda _t, reading, force: reading + force @ per_force.T)
-    return Strangeness(hidden, expected=(_either(("rate", "acceleration")),))
+    return UnknownEffect(hidden, expected=(_either(("rate", "acceleration")),))
 
 
-def _lens_switch(rng: np.random.Generator, size: float) -> Strangeness:
+def _lens_switch(rng: np.random.Generator, size: float) -> UnknownEffect:
     part, at_s = _sign(rng) * 0.012 * size * rng.uniform(0.8, 1.25), rng.uniform(1.0, 2.2)
     hidden = Hidden(focal_scale=lambda t: np.where(np.asarray(t) < at_s, 1.0, 1 + part))
-    return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
+    return UnknownEffect(hidden, expected=(_either(("scale", "time")),), lasting=False)
 
 
-def _wandering(rng: np.random.Generator, size: float) -> Strangeness:
+def _wandering(rng: np.random.Generator, size: float) -> UnknownEffect:
     """Timestamps of a clock that drifts back and forth."""
     late_s, hz, phase = 1.5e-3 * size * rng.uniform(0.8, 1.25), rng.uniform(0.35, 0.7), rng.uniform(0, 2 * np.pi)
     hidden = Hidden(clock_s=lambda stamp_s: late_s * np.sin(2 * np.pi * hz * stamp_s + phase))
-    return Strangeness(hidden, expected=(_either(("delay", "time")),), lasting=False)
+    return UnknownEffect(hidden, expected=(_either(("delay", "time")),), lasting=False)
 
 
-def _shading(rng: np.random.Generator, size: float) -> Strangeness:
+def _shading(rng: np.random.Generator, size: float) -> UnknownEffect:
     """An off-centre vignette, or an object in front of one side of the lens."""
     part, turn, kind = 0.05 * size * rng.uniform(0.8, 1.25), rng.uniform(0, 2 * np.pi), int(rng.integers(2))
     way = np.cos(turn), np.sin(turn)
@@ -166,11 +166,11 @@ def _shading(rng: np.random.Generator, size: float) -> Strangeness:
         along = 2 * ((x - 0.5) * way[0] + (y - 0.5) * way[1])
         return np.asarray(1 - part * (along + 1) / 2 if kind else 1 - 1.5 * part * np.clip(along, 0, None) ** 2)
 
-    return Strangeness(Hidden(light=light), expected=(_either(("gain", "x, y")),), lasting=False)
+    return UnknownEffect(Hidden(light=light), expected=(_either(("gain", "x, y")),), lasting=False)
 
 
-def _passing(rng: np.random.Generator, size: float) -> Strangeness:
-    """A soft shadow that covers one side for a while, or a moving shadow band; no form describes it."""
+def _passing(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """A soft shadow on one side for a while, or a moving shadow band; no field describes it."""
     part, turn, kind = 0.1 * size * rng.uniform(0.8, 1.25), rng.uniform(0, 2 * np.pi), int(rng.integers(2))
     way, at_s, lasting_s = (np.cos(turn), np.sin(turn)), rng.uniform(1.0, 2.0), rng.uniform(0.5, 0.9)
 
@@ -179,61 +179,61 @@ def _passing(rng: np.random.Generator, size: float) -> Strangeness:
         side = np.exp(-(since**2)) / (1 + np.exp(-along / 0.15))
         return np.asarray(1 - part * (np.exp(-(((along - since) / 0.4) ** 2)) if kind else side))
 
-    return Strangeness(Hidden(shadow=shadow), nameless=True, lasting=False)
+    return UnknownEffect(Hidden(shadow=shadow), nameless=True, lasting=False)
 
 
-def _hunting(rng: np.random.Generator, size: float) -> Strangeness:
-    """An autofocus that hunts, without a log."""
+def _hunting(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """A hunting autofocus without a log of the focus distance."""
     part, hz, phase = 0.003 * size * rng.uniform(0.8, 1.25), rng.uniform(1.0, 1.8), rng.uniform(0, 2 * np.pi)
     hidden = Hidden(focal_scale=lambda t: 1 + part * np.sin(2 * np.pi * hz * np.asarray(t) + phase))
-    return Strangeness(hidden, expected=(_either(("scale", "time")),), lasting=False)
+    return UnknownEffect(hidden, expected=(_either(("scale", "time")),), lasting=False)
 
 
-def _sticking(rng: np.random.Generator, size: float) -> Strangeness:
-    """A dead zone of the gyroscope: rates below a threshold read as 0, others are too small by it."""
+def _sticking(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """Dead zone of the gyroscope: rates below a threshold read 0, larger ones are reduced by it."""
     threshold = 0.008 * size * rng.uniform(0.8, 1.25)
 
     def stuck(_time: Array, reading: Array, _force: Array) -> Array:
         return np.asarray(np.sign(reading) * np.maximum(np.abs(reading) - threshold, 0.0))
 
-    return Strangeness(Hidden(gyro=stuck), expected=(_either(("rate", "rate")),))
+    return UnknownEffect(Hidden(gyro=stuck), expected=(_either(("rate", "rate")),))
 
 
-def _changing_readout(rng: np.random.Generator, size: float) -> Strangeness:
-    """A readout that becomes slower at some time."""
+def _changing_readout(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """A readout time that changes during the capture."""
     longer_s, at_s = _sign(rng) * 1.2e-3 * size * rng.uniform(0.8, 1.25), rng.uniform(0.9, 2.0)
     hidden = Hidden(row_delay_at=lambda t, fraction: longer_s * fraction / (1 + np.exp(-(t - at_s) / 0.1)))
-    return Strangeness(hidden, expected=(_either(("delay", "row, time")),), lasting=False)
+    return UnknownEffect(hidden, expected=(_either(("delay", "row, time")),), lasting=False)
 
 
-def _changing_distortion(rng: np.random.Generator, size: float) -> Strangeness:
-    """Distortion that settles as the lens warms up."""
+def _changing_distortion(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """Distortion that drifts and settles as the lens warms up."""
     part, settling_s = _sign(rng) * 0.008 * size * rng.uniform(0.8, 1.25), rng.uniform(0.4, 0.9)
 
     def scale(time_s: Array, radius_px: Array) -> Array:
         return 1 + part * (np.asarray(radius_px) / 400) ** 2 * (1 - np.exp(-np.maximum(time_s, 0) / settling_s))
 
-    return Strangeness(Hidden(radial_scale=scale), expected=(_either(("scale", "radius, time")),), lasting=False)
+    return UnknownEffect(Hidden(radial_scale=scale), expected=(_either(("scale", "radius, time")),), lasting=False)
 
 
-def _soft_corners(rng: np.random.Generator, size: float) -> Strangeness:
+def _soft_corners(rng: np.random.Generator, size: float) -> UnknownEffect:
     hidden = Hidden(corner_blur_px=float(1.2 * size * rng.uniform(0.8, 1.25)))
-    return Strangeness(hidden, expected=(_either(("blur", "radius")),), lasting=False)
+    return UnknownEffect(hidden, expected=(_either(("blur", "radius")),), lasting=False)
 
 
-def _soft_moments(rng: np.random.Generator, size: float) -> Strangeness:
-    """Focus lost for 0.5 s."""
+def _soft_moments(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """Loss of focus for about 0.5 s."""
     sigma_px, at_s, lasting_s = 1.0 * size * rng.uniform(0.8, 1.25), rng.uniform(0.8, 2.2), rng.uniform(0.2, 0.3)
     hidden = Hidden(blur_px=lambda t: float(sigma_px * np.exp(-(((t - at_s) / lasting_s) ** 2))))
-    return Strangeness(hidden, expected=(_either(("blur", "time")),), lasting=False)
+    return UnknownEffect(hidden, expected=(_either(("blur", "time")),), lasting=False)
 
 
-def _two(rng: np.random.Generator, size: float) -> Strangeness:
+def _two(rng: np.random.Generator, size: float) -> UnknownEffect:
     uneven, lens = _uneven(rng, size), _tangential(rng, size)
     return replace(uneven, tangential=lens.tangential, expected=(*uneven.expected, *lens.expected))
 
 
-def _one_named(rng: np.random.Generator, size: float) -> Strangeness:
+def _one_named(rng: np.random.Generator, size: float) -> UnknownEffect:
     effects = (
         f"time_offset={_sign(rng) * rng.uniform(0.004, 0.009):.6f}",
         f"focal_length={1 + _sign(rng) * rng.uniform(0.03, 0.06):.4f}",
@@ -242,14 +242,14 @@ def _one_named(rng: np.random.Generator, size: float) -> Strangeness:
     return replace(_uneven(rng, size), effects=(str(rng.choice(effects)),))
 
 
-def _nothing(_rng: np.random.Generator, _size: float) -> Strangeness:
-    return Strangeness()
+def _nothing(_rng: np.random.Generator, _size: float) -> UnknownEffect:
+    return UnknownEffect()
 
 
-def _named_only(rng: np.random.Generator, _size: float) -> Strangeness:
+def _named_only(rng: np.random.Generator, _size: float) -> UnknownEffect:
     names = ("time_offset", "readout_time", "gyro_bias", "focal_length", "focal_drift", "radial_distortion",
              "principal_point", "stabilisation", "vignetting", "defocus")  # fmt: skip
-    return Strangeness(effects=tuple(str(name) for name in rng.choice(names, 2, replace=False)))
+    return UnknownEffect(effects=tuple(str(name) for name in rng.choice(names, 2, replace=False)))
 
 
 EFFECTS: dict[str, Draw] = {
@@ -280,12 +280,12 @@ CASES = {**EFFECTS, NULL: _nothing, NAMED_ONLY: _named_only}
 # ── captures ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tuple[Strangeness, list[str]]:
-    """Write a capture, unless it exists, and return its unknown effect and its named effects.
+def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tuple[UnknownEffect, list[str]]:
+    """Write a capture unless it exists: its unknown effect and the names of its catalogue effects.
 
-    other: a second capture of the same phone, with another motion, scene and light.
+    other: a second capture of the same phone, with another motion, scene and exposure.
     """
-    strange = CASES[name](np.random.default_rng([seed, 11]), 1.0 if seed % 2 else 2.6)
+    unknown = CASES[name](np.random.default_rng([seed, 11]), 1.0 if seed % 2 else 2.6)
     rng = np.random.default_rng([seed, 12 + other])
     frames = FRAMES_OF_OTHER if other else FRAMES
     distortion = ("radtan", (-0.02, 0.0, 0.0, 0.0, 0.0)) if seed % 3 == 0 else ("none", ())
@@ -297,7 +297,7 @@ def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tu
         response=ResponseCurve("srgb"), distortion=distortion, depth_m=2.0 if acceleration else np.inf,
     )  # fmt: skip
     context = EffectContext(frames, FPS, np.random.default_rng([seed, 16]))
-    true, applied = hide_effects(nominal, strange.effects, context)
+    true, applied = hide_effects(nominal, unknown.effects, context)
     settings = SessionSettings(
         scene=str(rng.choice(SCENES)),
         frames=frames,
@@ -311,15 +311,15 @@ def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tu
     )
     named = [effect.name for effect in applied]
     if not (folder / "movie.mp4").exists():
-        session = plan_session(nominal, off_centre(true, strange.tangential), settings, hidden=strange.hidden)
+        session = plan_session(nominal, with_tangential(true, unknown.tangential), settings, hidden=unknown.hidden)
         bits_per_px = float(rng.uniform(0.12, 0.4))
         options = RecordingOptions(bits_per_px=bits_per_px, truth_frames=name in EFFECTS and not other)
         write_recording(session, folder, applied=applied, options=options)
-    return strange, named
+    return unknown, named
 
 
-def off_centre(profile: CameraProfile, tangential: tuple[float, float]) -> CameraProfile:
-    """The profile with p1 and p2 in its lens."""
+def with_tangential(profile: CameraProfile, tangential: tuple[float, float]) -> CameraProfile:
+    """Set the tangential distortion p1, p2 of the profile's lens."""
     lens = profile.intrinsics
     assert lens is not None
     if not any(tangential):
@@ -328,8 +328,8 @@ def off_centre(profile: CameraProfile, tangential: tuple[float, float]) -> Camer
     return replace(profile, intrinsics=replace(lens, model="radtan", coefficients=(k1, k2, *tangential, k3)))
 
 
-def points_off_px(source: Source, profiles: list[CameraProfile]) -> tuple[list[float], float]:
-    """Residual rms of a capture's points with each profile, and the tracking noise."""
+def residuals_px(source: Source, profiles: list[CameraProfile]) -> tuple[list[float], float]:
+    """RMS residual of a capture's tracked points with each profile, and the tracking noise."""
     capture = source.capture
     indices = [frame.index for frame in capture.frames if frame.skip_reason is None]
     pairs = track_pairs(source.gray(indices))
@@ -340,11 +340,11 @@ def points_off_px(source: Source, profiles: list[CameraProfile]) -> tuple[list[f
 
 
 def picture_gains_db(folder: Path, found: CameraProfile) -> list[float]:
-    """PSNR of frames restored with the found profile, minus that with the capture's own."""
+    """PSNR gain of frames restored with the found profile over the capture's own."""
     write_profile(found, folder / "found.yaml")
     with_found = ("--config", str(folder / "found.yaml"))
     runs = [
-        run_process(folder, folder / name, "--preset", PRESET, "--frames", LOOKED_AT, *config)
+        run_process(folder, folder / name, "--preset", PRESET, "--frames", RESTORED_FRAMES, *config)
         for name, config in (("nominal", ()), ("extended", with_found))
     ]
     gains = []
@@ -361,40 +361,40 @@ def picture_gains_db(folder: Path, found: CameraProfile) -> list[float]:
 
 
 def judge_case(work: Path, name: str, seed: int) -> Row:
-    """Simulate, diagnose, compare; try the extended profile on another capture of the same phone."""
+    """Simulate, diagnose and compare; apply the extended profile to another capture of the same phone."""
     folder = work / f"{name}_{seed}"
-    strange, named = write_case(folder, name, seed)
+    unknown, named = write_case(folder, name, seed)
     source = open_source(folder)
     begun = time.process_time()
     found = diagnose_capture(source.capture, source.profile, source.pictures, source.gray)
     seconds = time.process_time() - begun
-    gains_db = picture_gains_db(folder, found.extended_profile) if strange.expected and found.fields else []
-    gone = None
-    if strange.lasting and strange.expected:
+    gains_db = picture_gains_db(folder, found.extended_profile) if unknown.expected and found.fields else []
+    removed = None
+    if unknown.lasting and unknown.expected:
         folder = work / f"{name}_{seed}_other"
         write_case(folder, name, seed, other=True)
-        (before, after), noise = points_off_px(open_source(folder), [source.profile, found.extended_profile])
-        gone = 1 - (after**2 - noise**2) / max(before**2 - noise**2, 1e-9)
+        (before, after), noise = residuals_px(open_source(folder), [source.profile, found.extended_profile])
+        removed = 1 - (after**2 - noise**2) / max(before**2 - noise**2, 1e-9)
     causes = [cause.name for cause in found.causes]
     fields = [(field.kind, ", ".join(field.covariates), field.shape) for field in found.fields]
     return {
         "hidden": name, "seed": seed, "size": "weak" if seed % 2 else "strong", "verdict": found.verdict,
         "named": named, "causes": causes, "fields": fields,
-        "right": is_right(strange, named, found),
+        "right": is_right(unknown, named, found),
         "rms_px": found.nominal.geometry_rms_px, "noise_px": found.nominal.geometry_noise_px,
         "gain": [field.held_out.gain for field in found.fields],
-        "gone_elsewhere": gone, "pictures_db": gains_db, "cpu_s": round(seconds, 1),
+        "gone_elsewhere": removed, "pictures_db": gains_db, "cpu_s": round(seconds, 1),
         "sentences": [field.sentence for field in found.fields],
     }  # fmt: skip
 
 
-def is_right(strange: Strangeness, named: list[str], found: Diagnosis) -> bool:
-    """Whether each field has an expected kind and covariate, and each cause is a hidden one or its rival."""
+def is_right(unknown: UnknownEffect, named: list[str], found: Diagnosis) -> bool:
+    """Whether the fields have the expected kinds and covariates, and each cause or a rival of it was hidden."""
     fields = [(field.kind, ", ".join(field.covariates)) for field in found.fields]
-    if len(fields) != len(strange.expected) or any(set(fields).isdisjoint(pairs) for pairs in strange.expected):
+    if len(fields) != len(unknown.expected) or any(set(fields).isdisjoint(pairs) for pairs in unknown.expected):
         return False
     known = [{cause.name, *(rival.name for rival in cause.rivals)} for cause in found.causes]
-    if strange.nameless:
+    if unknown.nameless:
         return not known
     if not named and not fields:
         return found.verdict == CONSISTENT
@@ -402,7 +402,7 @@ def is_right(strange: Strangeness, named: list[str], found: Diagnosis) -> bool:
 
 
 def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Each effect with several seeds, as many captures with only named effects, and captures without effects."""
+    """Judge each unknown effect with several seeds, captures with only named effects, and captures without effects."""
     cases = [(name, FIRST_SEED + 10 * k + i) for k in range(SEEDS[scale.name]) for i, name in enumerate(EFFECTS)]
     cases += [(NAMED_ONLY, FIRST_SEED + 500 + k) for k in range(SEEDS[scale.name])]
     cases += [(NULL, FIRST_NULL + k) for k in range(NULLS[scale.name])]
@@ -412,7 +412,7 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     summary = {
         "captures": len(hidden),
         "right": sum(row["right"] for row in hidden),
-        "solved_elsewhere": sum(gone >= SOLVED for gone in elsewhere),
+        "solved_elsewhere": sum(fraction >= SOLVED for fraction in elsewhere),
         "of_elsewhere": len(elsewhere),
         "pictures_better": sum(np.mean(row["pictures_db"]) > HARM_DB for row in rows if row["pictures_db"]),
         "pictures_worse": sum(min(row["pictures_db"]) < -HARM_DB for row in rows if row["pictures_db"]),

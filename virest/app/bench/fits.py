@@ -1,7 +1,7 @@
-"""Fit constants that a single capture cannot determine to captures with truth: best values and their deviations.
+"""Fit constants that a single capture cannot determine, on captures with truth: best values and standard deviations.
 
-The captures are those of the honesty table with other seeds, so that ``--only honesty`` tests independently what is
-fitted here.  Standard deviations are between captures: each is left out once (jackknife).
+The captures are those of the honesty table with other seeds, so ``--only honesty`` is an independent test of the fit.
+Standard deviations are jackknife estimates over captures.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ OTHER_SEEDS = 1000
 LEFT_OVER_NAMES = ("constant", "ideal filter's", "neighbours'")
 LEFT_OVER_PRESETS = ("fast", "balanced")
 OUTLYING_DB = 0.5
-"""Errors of the predicted gain above this are weighted by less than their square (robust loss)."""
+"""Error of the predicted gain at which the soft-L1 loss departs from the square."""
 
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """A constant with the values to try on all captures."""
+    """A module constant and the values to try on all captures."""
 
     name: str
     module: ModuleType
@@ -57,7 +57,7 @@ SWEPT = (
 
 
 def fits_section(work: Path, scale: Scale) -> tuple[Row, str]:
-    """Fit the predicted gain to the measured gains, and find the best values of the other constants."""
+    """Fit the constants of the predicted gain to measured gains, and find the best values of the swept constants."""
     rows: list[Row] = []
     gains: dict[str, list[Array]] = {swept.name: [] for swept in SWEPT}
     for workload in fit_workloads(scale):
@@ -83,21 +83,21 @@ def fit_workloads(scale: Scale) -> list[Workload]:
 
 
 def fit_left_over(rows: Sequence[Row]) -> Row:
-    """Coefficients of :data:`confirmation.LEFT_OVER` that promise the gains best, their deviations, and the scatter.
+    """Fit the coefficients of :data:`confirmation.LEFT_OVER` to the gains: values, standard deviations and scatter.
 
     rows: with ``capture``, ``removed``, ``misplaced``, ``logarithms`` (1, ln ideal, ln left) and ``gain_db``.  Captures
-    count alike.
+    have equal weight.
     """
     captures = np.array([row["capture"] for row in rows])
     names = list(dict.fromkeys(captures.tolist()))
     fitted = _fitted(rows, captures)
     left_out = [_fitted([r for r in rows if r["capture"] != n], captures[captures != n]) for n in names]
-    spread = np.sqrt((len(names) - 1) * np.var(left_out, axis=0)) if len(names) > 1 else np.full(len(fitted), np.nan)
+    std = np.sqrt((len(names) - 1) * np.var(left_out, axis=0)) if len(names) > 1 else np.full(len(fitted), np.nan)
     off_db = np.abs(_promised_db(rows, fitted) - [row["gain_db"] for row in rows])
     slopes = (_promised_db(rows, fitted - (0.05, 0, 0)) - _promised_db(rows, fitted)) / 0.05
     return {
         "coefficients": fitted.tolist(),
-        "std": spread.tolist(),
+        "std": std.tolist(),
         "scatter": float(1.4826 * np.median(off_db / np.maximum(slopes, 1e-3))),
         "off_db": float(np.median(off_db)),
         "captures": len(names),
@@ -106,20 +106,20 @@ def fit_left_over(rows: Sequence[Row]) -> Row:
 
 
 def best_value(values: Sequence[float], gains_db: Array) -> Row:
-    """Value with the largest mean gain (captures, values), by a parabola over its logarithm, and its deviation."""
+    """Value with the largest mean of gains_db (captures, values), by a parabola over its logarithm, and its std."""
     found = _peak(values, gains_db.mean(axis=0))
     count = len(gains_db)
     left_out = [_peak(values, np.delete(gains_db, k, axis=0).mean(axis=0)) for k in range(count)] if count > 1 else []
-    spread = float(np.sqrt((count - 1) * np.var(left_out))) if left_out else float("nan")
-    return {"best": float(np.exp(found)), "std": float(np.exp(found) * spread), "captures": count}
+    log_std = float(np.sqrt((count - 1) * np.var(left_out))) if left_out else float("nan")
+    return {"best": float(np.exp(found)), "std": float(np.exp(found) * log_std), "captures": count}
 
 
 # ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, slots=True)
-class _Watched(ConfirmedGain):
-    """Records the arguments of its calls."""
+class _RecordingGain(ConfirmedGain):
+    """A ConfirmedGain that records the arguments of its calls."""
 
     asked: list[tuple[float, float, float, Misplaced]] = field(default_factory=list)
 
@@ -136,7 +136,7 @@ def _opened(work: Path, workload: Workload) -> TrueCapture:
 
 
 def _psnr_db(truth: TrueCapture, plan: RestorationPlan) -> dict[int, tuple[float, tuple[int, int, int, int]]]:
-    """PSNR and rectangle of each frame as a plan restores it."""
+    """PSNR and valid rectangle of each frame restored by a plan."""
     return {r.frame.index: (_against_truth(truth, r, r.valid_px), r.valid_px) for r in truth.restored(plan)}
 
 
@@ -148,15 +148,17 @@ def _against_truth(truth: TrueCapture, restored: RestoredFrame, valid_px: tuple[
 def _promises(
     truth: TrueCapture, plan: RestorationPlan, workload: Workload, straight_db: dict[int, Any]
 ) -> Iterator[Row]:
-    """The terms of each deblurred frame's predicted gain, and its measured gain."""
+    """Terms of the predicted gain of each deblurred frame, and its measured gain."""
     if plan.confirmed is None or plan.confirmed.share <= 0:
         return
     for preset in LEFT_OVER_PRESETS:
-        watched = _Watched(**{f.name: getattr(plan.confirmed, f.name) for f in dataclasses.fields(ConfirmedGain)})
-        for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=watched)):
+        recorder = _RecordingGain(
+            **{f.name: getattr(plan.confirmed, f.name) for f in dataclasses.fields(ConfirmedGain)}
+        )
+        for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=recorder)):
             if restored.degradation is None or restored.degradation.deblur is None:
                 continue
-            changed, lost, ideal, misplaced = watched.asked[-1]
+            changed, lost, ideal, misplaced = recorder.asked[-1]
             gone = confirmation.removed(changed, lost)
             before_db, valid_px = straight_db[restored.frame.index]
             yield {
@@ -165,13 +167,13 @@ def _promises(
                 "frame": restored.frame.index,
                 "removed": gone,
                 "misplaced": np.stack((*misplaced.errors(gone), misplaced.weight)).tolist(),
-                "logarithms": confirmation.tellers(ideal, watched.left).tolist(),
+                "logarithms": confirmation.tellers(ideal, recorder.left).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
             }
 
 
 def _swept_gains(truth: TrueCapture, plan: RestorationPlan, swept: Swept, straight_db: dict[int, Any]) -> Array:
-    """(values,) mean gain of a capture's frames with the constant set to each."""
+    """Mean gain (values,) of a capture's frames with the constant set to each value."""
     usual, found = getattr(swept.module, swept.attribute), []
     try:
         for value in swept.values:
@@ -195,7 +197,7 @@ def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
 
 
 def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:
-    """(3,) coefficients."""
+    """Coefficients (3,) by robust least squares."""
     gain_db = np.array([row["gain_db"] for row in rows])
     weight = 1 / np.sqrt([np.count_nonzero(captures == name) for name in captures])
     weight /= weight.mean()
@@ -207,7 +209,7 @@ def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:
 
 
 def _peak(values: Sequence[float], gains_db: Array) -> float:
-    """Logarithm of the value at which a parabola through the best and its neighbours is highest."""
+    """Log of the value at the peak of a parabola through the best value and its neighbours."""
     logarithms, at = np.log(values), int(np.clip(np.argmax(gains_db), 1, len(values) - 2))
     bend, slope, _ = np.polyfit(logarithms[at - 1 : at + 2], gains_db[at - 1 : at + 2], 2)
     peak = -slope / (2 * bend) if bend < 0 else logarithms[int(np.argmax(gains_db))]

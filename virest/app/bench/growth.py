@@ -1,4 +1,4 @@
-"""How the time per frame grows with the number of frames (it should not), with the pixels, and with the tiles.
+"""Growth of the time per frame with the number of frames (none expected), of pixels, and of tiles.
 
 $ python -m virest.app.bench --only growth --quick
 """
@@ -85,7 +85,7 @@ def _times(found: Facts) -> Facts:
 
 
 def fitted_exponent(sizes: Sequence[float], times: Sequence[float]) -> tuple[float, float | None]:
-    """p of time = c · size^p, by least squares over the logarithms, and its standard deviation (from three on)."""
+    """Exponent p of time = c · size^p by log-log least squares, and its standard deviation (None below three sizes)."""
     x, y = np.log(np.asarray(sizes, float)), np.log(np.asarray(times, float))
     x = x - x.mean()
     exponent = float(x @ y / (x @ x))
@@ -96,7 +96,7 @@ def fitted_exponent(sizes: Sequence[float], times: Sequence[float]) -> tuple[flo
 
 
 def _fitted(rows: list[Facts], size: str, seconds: str) -> Facts:
-    """Exponent over the rows; none if other processes made a difference of two runs negative."""
+    """Exponent over the rows; None if load by other processes made a difference of two runs negative."""
     if any(row[seconds] <= 0 for row in rows):
         return {"exponent": None, "std": None}
     exponent, std = fitted_exponent([row[size] for row in rows], [row[seconds] for row in rows])
@@ -104,9 +104,9 @@ def _fitted(rows: list[Facts], size: str, seconds: str) -> Facts:
 
 
 def doubling_exponents(rows: list[Facts]) -> dict[str, float | None]:
-    """p of time = start + c · frames^p from runs over N, 2 N and 4 N, for which it has no residual: 1 is flat a frame.
+    """Exponent p of time = start + c · frames^p from runs over N, 2 N and 4 N frames; 1: constant time per frame.
 
-    (T(4N) − T(2N)) / (T(2N) − T(N)) = 2^p.
+    Exact for three runs: (T(4N) − T(2N)) / (T(2N) − T(N)) = 2^p.
     """
 
     def exponent(key: str) -> float | None:
@@ -119,7 +119,7 @@ def doubling_exponents(rows: list[Facts]) -> dict[str, float | None]:
 
 
 def with_steps(rows: list[Facts]) -> list[Facts]:
-    """Each run with the time per additional frame over the previous run; the first run has none."""
+    """Add to each run its time per additional frame relative to the previous run; None for the first."""
     steps: list[Facts] = [{"s_per_frame": None, "cpu_s_per_frame": None}]
     for before, after in pairwise(rows):
         more = after["frames"] - before["frames"]
@@ -151,7 +151,7 @@ def growth_text(facts: Facts) -> str:
 
 
 def exponent_text(fit: Facts) -> str:
-    """An exponent with its standard deviation, if three points give one."""
+    """An exponent as text, with its standard deviation if known."""
     if fit["exponent"] is None:
         return "not determined by these runs"
     return f"{fit['exponent']:.2f}" + (f" ± {fit['std']:.2f}" if fit.get("std") is not None else "")

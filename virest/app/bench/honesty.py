@@ -1,7 +1,7 @@
 """Predicted against measured gain of deblurring, for each frame with truth.
 
-Measured gain: PSNR of the restored frame minus that of ``--deblur none`` with the same warp.  A frame left as recorded
-has no prediction and gains 0.
+Measured gain: PSNR of the restored frame minus that of ``--deblur none`` with the same warp.  A frame that is not
+deblurred has no prediction and a gain of 0.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ Row = dict[str, Any]
 WORSE_DB = 0.1
 """A frame that loses more than this counts as made worse."""
 OBEDIENT, DEFOCUSED, PHONE = "obedient", "defocused", "phone"
+"""Sets of captures: conforming to the camera model; with defocus in the profile; with a phone's own processing."""
 SETS = (OBEDIENT, DEFOCUSED, PHONE)
 
 
@@ -79,7 +80,7 @@ def frames_text(rows: Sequence[Row], presets: Sequence[str]) -> str:
 
 
 def honesty_text(summary: Sequence[Row]) -> str:
-    """The table of all sets; captures first, sets in capitals."""
+    """Table of all captures, followed by the sets in capitals."""
     header = ["capture", "preset", "frames", "deblurred", "mean gain", "worse", "their mean", "worst",
               "promised", "|promise-gain|", "promised, worse"]  # fmt: skip
     lines = [_summary_cells(entry) for entry in summary]

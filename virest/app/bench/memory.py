@@ -1,4 +1,4 @@
-"""Peak memory of the program and of its largest worker for short and long movies; it must not grow."""
+"""Peak memory of the program and of its largest worker for short and long movies, which must not grow."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Peaks:
     """Peak memory of a command."""
 
     together_bytes: int
-    """Largest sum of the resident bytes of all its processes; shared pages count once for each."""
+    """Largest sum of the resident memory of all processes; shared pages count once per process."""
     main_bytes: int
     """Peak of the main process."""
     worker_bytes: int
@@ -34,7 +34,7 @@ class Peaks:
 
 
 def memory_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Monitor runs over few and over many frames."""
+    """Measure the memory of runs over few and many frames."""
     counts = QUICK_FRAMES if scale.quick else FULL_FRAMES if scale.full else FRAMES
     results = []
     for frames in counts:
@@ -79,8 +79,8 @@ def memory_text(facts: dict[str, Any]) -> str:
 def peaks_of(command: list[str]) -> Peaks:
     """Run a command and sample its memory and its descendants' 20 times per second.
 
-    A process's own peak is the kernel's (VmHWM), so peaks between samples are included; the last sample of each process
-    counts, since before exec a new process still shows its parent's peak.
+    The peak of a process is the kernel's VmHWM, so peaks between samples are included.  The last sample of each process
+    counts, since before exec a new process still reports its parent's peak.
     """
     began = time.perf_counter()
     together, own = 0, {}

@@ -1,4 +1,4 @@
-"""Other libraries' deconvolutions over a capture: scikit-image's (:mod:`virest.evaluation.baselines`) and deepinv's."""
+"""Deconvolution by other libraries: scikit-image (:mod:`virest.evaluation.baselines`) and deepinv."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Plane = NDArray[np.float32]
 PEERS: dict[str, tuple[Deconvolve, tuple[float, ...]]] = {
     name: (baseline.deconvolve, baseline.settings) for name, baseline in SCIKIT.items()
 }
-"""Peers with the settings tried on every frame; the best by PSNR against truth counts."""
+"""Methods and the settings tried on every frame; the setting with the best PSNR against truth counts."""
 
 
 def frame_motions(capture_folder: Path) -> tuple[ResponseCurve, dict[int, RowMotion]]:
-    """Read the curve, and each usable frame's motion."""
+    """Response curve of a capture, and the motion of each usable frame."""
     capture = read_capture(capture_folder)
     profile, _ = resolve_profile(capture, None)
     trajectory = integrate_gyro(capture.imu, profile)
@@ -42,7 +42,7 @@ def peer_pictures(name: str, picture: Picture, motion: RowMotion, curve: Respons
 def peer_deblurred(
     method: Deconvolve, setting: float, picture: Picture, motion: RowMotion, curve: ResponseCurve
 ) -> Picture:
-    """One frame, with each channel's linear light deconvolved with the kernel of the frame centre."""
+    """Deconvolve the linear light of each channel of a frame with the kernel at the frame's centre."""
     psf = centre_psf(motion)
     return deblurred(picture, lambda plane: method(plane, psf, setting), psf, curve)
 
@@ -60,9 +60,9 @@ def deepinv_available() -> bool:
 
 
 def deepinv_wiener(plane: Plane, psf: Plane, noise_to_signal: Any) -> Plane:
-    """Conj(K) / (|K|² + N/S) by deepinv on one thread: a circular BlurFFT and its WienerDeconvolution, flat prior.
+    """Wiener filter conj(K) / (|K|² + N/S) by deepinv on one thread: circular BlurFFT, WienerDeconvolution, flat prior.
 
-    psf: as a convolution takes it, which is deepinv's convention too.
+    psf: convolution kernel, which is also deepinv's convention.
     """
     import torch
     from deepinv.models import WienerDeconvolution

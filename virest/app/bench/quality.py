@@ -1,4 +1,4 @@
-"""PSNR gained over straightening alone, on simulated rotation-only captures with truth; presets and peers."""
+"""PSNR gain over straightening alone on simulated captures with truth, for presets and peers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from virest.evaluation.fidelity import psnr_db
 
 METHODS = (*PRESETS, *PEERS)
 SHORT = {"unsupervised_wiener": "unsup. wiener", "richardson_lucy": "rich.-lucy"}
-"""Column heads."""
+"""Column headings."""
 KIND_TITLES = {
     "ordinary": "ordinary: 5-20 px",
     "photographs": "photographs: 5-20 px",
@@ -37,7 +37,7 @@ KIND_TITLES = {
 
 
 def quality_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Measure every frame of every capture. Gains in dB, above ``--deblur none`` and the same warp."""
+    """Measure every frame of every capture: gains in dB over ``--deblur none`` with the same warp."""
     rows = []
     for workload in quality_workloads(scale):
         found = measure_workload(work, workload)
@@ -49,7 +49,7 @@ def quality_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def measure_workload(work: Path, workload: Workload) -> list[dict[str, Any]]:
-    """One record per frame: blur, PSNR of straightening alone, gain of each preset and peer."""
+    """One record per frame: blur, PSNR of straightening alone, and gain of each preset and peer."""
     capture = simulated(work, workload.name, **workload.options)
     base = run_process(capture, work / "none", "--deblur", "none")
     runs = {preset: run_process(capture, work / preset, "--preset", preset) for preset in PRESETS}
@@ -108,7 +108,7 @@ def _summary(kind: str, name: str | None, rows: list[dict[str, Any]]) -> dict[st
 
 
 def _text(summary: list[dict[str, Any]]) -> str:
-    """Means and minima; a kind gets rows of its own only if it has several captures."""
+    """Tables of means and minima; a kind gets a summary row only if it has several captures."""
     several = {kind for kind in KIND_TITLES if sum(entry["kind"] == kind for entry in summary) > 2}
     shown = [entry for entry in summary if entry["capture"] or entry["kind"] in several]
     means, minima = [], []

@@ -1,4 +1,4 @@
-"""Real captures (in the folder named by VIREST_REALDATA): the results of process, calibrate and diagnose."""
+"""Results of process, calibrate and diagnose on real captures, in the folder named by VIREST_REALDATA."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CALIBRATED = {"lhaippp_car": (), "nexus5_162941": ("clock-skew",), "gopro_karma"
 DIAGNOSED = ("lhaippp_car", "nexus5_162941", "honor_v10", "gopro_hero7")
 PRESET, COUNTED = "fast", ("deblurred", "straightened", "copied", "skipped", "failed")
 ON_TIME = ("nexus5_162941",)
-"""Captures whose unknown offset is also set to 0, for the diagnosis to find."""
+"""Captures that are also diagnosed with the time offset set to 0, to be found by the diagnosis."""
 Row = list[str]
 
 

@@ -1,4 +1,4 @@
-"""Errors of straightened points against truth, for all four readout directions."""
+"""Position errors of straightened points against truth, for all four readout directions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIZES = {"640x480": (640, 480), "720x1280": (720, 1280)}
 
 
 def shutter_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Median and 90th percentile of the distance between a truth's corners and the same points of the picture, px."""
+    """Median and 90th percentile of the distance (px) between corners of the truth and the same points of the frame."""
     sizes = dict(list(SIZES.items())[:1]) if scale.quick else SIZES
     frames = 3 if scale.quick else 8
     results = [_measure(work, size, direction, frames) for size in sizes for direction in READOUT_DIRECTIONS]

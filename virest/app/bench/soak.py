@@ -1,7 +1,7 @@
-"""200 captures in one run, 1 of 10 broken, in ten ways: all good ones must be restored, and nothing must grow.
+"""Soak test: 200 captures in one run, 1 of 10 with one of ten defects.  All good ones must be restored without growth.
 
-Memory and open files of the program and its workers are sampled throughout; the last quarter of the run is compared
-with the second, since the first one fills caches.
+Memory and open files of the program and its workers are sampled throughout.  The last quarter of the run is compared
+with the second, since the first fills caches.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ SHIFT_NS = 10**15
 
 
 def soak_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
-    """Write the captures, process them in one run, and check the result of each."""
+    """Write the captures, process them in one run, and check each result."""
     count = QUICK_CAPTURES if scale.quick else CAPTURES
     source = simulated(work, "soak-source", width=240, height=180, frames=FRAMES, seed=3)
     broken = dict(_write_captures(work / "soak", source, count))
     folders = sorted((work / "soak").iterdir())
     out = work / "soak-out"
     command = [sys.executable, "-m", "virest", "process", *map(str, folders), "--out", str(out)]
-    code, errors, samples = _watched([*command, "--preset", "fast", "--jobs", "2"], work / "soak.log")
+    code, errors, samples = _monitored([*command, "--preset", "fast", "--jobs", "2"], work / "soak.log")
     facts = {"captures": count, "exit_code": code, **_judge(folders, broken, out, errors), **_growth(samples)}
     for folder in (work / "soak", out):
         shutil.rmtree(folder)
@@ -52,15 +52,15 @@ def soak_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def _write_captures(folder: Path, source: Path, count: int) -> Iterator[tuple[str, str]]:
-    """Copy one capture, every tenth copy broken; returns (name, defect) of those."""
+    """Copy one capture ``count`` times and damage every tenth copy; yields (name, defect) of those."""
     folder.mkdir()
     for number in range(count):
         copy = folder / f"capture-{number:04d}"
         shutil.copytree(source, copy, ignore=shutil.ignore_patterns("truth*"))
         if number % BROKEN_EVERY == BROKEN_EVERY - 1:
-            way = list(WAYS)[number // BROKEN_EVERY % len(WAYS)]
-            WAYS[way](copy)
-            yield copy.name, way
+            defect = list(DEFECTS)[number // BROKEN_EVERY % len(DEFECTS)]
+            DEFECTS[defect](copy)
+            yield copy.name, defect
 
 
 def _cut_movie(folder: Path) -> None:
@@ -69,7 +69,7 @@ def _cut_movie(folder: Path) -> None:
 
 
 def _spoil_movie(folder: Path) -> None:
-    """Overwrite the last third of the pictures' data; the tables stay."""
+    """Overwrite the last third of the media data; the index is unchanged."""
     movie = folder / "movie.mp4"
     data = bytearray(movie.read_bytes())
     start = data.find(b"mdat")
@@ -87,7 +87,7 @@ def _empty_gyro(folder: Path) -> None:
 
 
 def _other_session(folder: Path) -> None:
-    """Shift the gyroscope's times by 11 days."""
+    """Shift the gyroscope's timestamps by SHIFT_NS, about 11.6 days."""
     path = folder / "gyro_accel.csv"
     lines = path.read_text().splitlines()
     rows = (line.partition(",") for line in lines[HEAD_LINES:])
@@ -122,7 +122,7 @@ def _remove_all(folder: Path) -> None:
     folder.mkdir()
 
 
-WAYS: dict[str, Callable[[Path], None]] = {
+DEFECTS: dict[str, Callable[[Path], None]] = {
     "movie cut": _cut_movie,
     "movie spoilt": _spoil_movie,
     "movie empty": _empty_movie,
@@ -136,10 +136,10 @@ WAYS: dict[str, Callable[[Path], None]] = {
 }
 
 
-# ── watching ─────────────────────────────────────────────────────────────────────────────────────────────────────
+# ── monitoring ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _watched(command: list[str], log: Path) -> tuple[int, str, list[tuple[float, int]]]:
+def _monitored(command: list[str], log: Path) -> tuple[int, str, list[tuple[float, int]]]:
     """Exit code, standard error, and (bytes, open files) of the whole process tree, sampled 4 times per second."""
     samples = []
     with log.open("w") as file, subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file) as process:
@@ -157,7 +157,7 @@ def _open_files(pid: int) -> int:
 
 
 def _growth(samples: list[tuple[float, int]]) -> dict[str, Any]:
-    """Medians of the second and the last quarter of the run."""
+    """Median memory and open files in the second and the last quarter of the run."""
     values = np.array(samples)
     quarter = len(values) // 4
     early, late = np.median(values[quarter : 2 * quarter], axis=0), np.median(values[3 * quarter :], axis=0)
@@ -169,23 +169,23 @@ def _growth(samples: list[tuple[float, int]]) -> dict[str, Any]:
 
 
 def _judge(folders: list[Path], broken: dict[str, str], out: Path, errors: str) -> dict[str, Any]:
-    """Good captures that are restored, and broken ones that are explained by their run.json."""
+    """Count the good captures restored, and the broken ones explained by their run.json."""
     accounts = {file.parent.name: json.loads(file.read_bytes()) for file in out.glob("*/run.json")}
     done = {name for name, account in accounts.items() if account["status"] == "done" and account["exit_code"] == 0}
-    said = {name: _explanation(accounts.get(name)) for name in broken}
+    explained = {name: _explanation(accounts.get(name)) for name in broken}
     return {
         "good": len(folders) - len(broken),
         "good_done": sum(folder.name in done for folder in folders if folder.name not in broken),
         "broken": len(broken),
-        "broken_explained": sum(bool(lines) for lines in said.values()),
-        "explanations": {broken[name]: lines[0] if lines else "" for name, lines in said.items()},
+        "broken_explained": sum(bool(lines) for lines in explained.values()),
+        "explanations": {broken[name]: lines[0] if lines else "" for name, lines in explained.items()},
         "tracebacks": errors.count("Traceback"),
         "left_over": sorted(p.name for p in out.rglob("*") if p.name.endswith((".part", ".lock")) or p.name == ".run"),
     }
 
 
 def _explanation(account: dict[str, Any] | None) -> list[str]:
-    """Why a capture was not processed, or what is wrong with it; empty if its run.json does not explain it."""
+    """Reasons why a capture was not processed, or warnings about it; empty if its run.json gives none."""
     if account is None:
         return []
     failed = [f"{account['counts']['failed']} frames failed"] if account["counts"]["failed"] else []
@@ -203,5 +203,5 @@ def _text(facts: dict[str, Any]) -> str:
         ["open files", "{} -> {}".format(*facts["open_files"]), "level"],
     ]
     title = f"SOAK: {facts['captures']} captures in one run, {facts['seconds']:.0f} s; second quarter -> last quarter\n"
-    said = "\n".join(f"  {way}: {line[:150]}" for way, line in facts["explanations"].items())
-    return title + table(["what", "found", "wanted"], rows) + "\n" + said
+    explanations = "\n".join(f"  {defect}: {line[:150]}" for defect, line in facts["explanations"].items())
+    return title + table(["what", "found", "wanted"], rows) + "\n" + explanations

@@ -1,8 +1,8 @@
-"""Frames per second from movie to PNGs: presets and stages, compared with the floor, parallel runs and other libraries.
+"""Frames per second from movie to PNGs, by preset and stage, compared with a floor, parallel runs and other libraries.
 
-The program runs over N and over 2 N frames of one looped 720x1280 capture; the difference of the two wall-clock times,
-divided by N, is the time per frame without start, reading and planning.  N is a whole number of segments per process.
-The floor is the same program without deblurring: decode, warp and PNG of the same frames remain.
+The program runs over N and over 2 N frames of one looped 720x1280 capture.  The difference of the two wall-clock times
+divided by N is the time per frame, excluding start-up, reading and planning.  N is a whole number of segments per
+process.  The floor is the same program without deblurring: only decoding, warping and PNG encoding remain.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ FLOOR = "floor"
 ARGUMENTS = {FLOOR: ("--preset", "fast", "--deblur", "none"), **{preset: ("--preset", preset) for preset in PRESETS}}
 FRAMES = {FLOOR: 120, "fast": 120, "balanced": 120, "best": 60}
 QUICK_FRAMES = dict.fromkeys(FRAMES, 60)
-"""Frames N with two processes, in segments of ten; one process gets half as many.  Whole loops of the capture, whose
-frames are not blurred alike."""
+"""Frames N with two processes, in segments of ten; one process gets half as many.  N covers whole loops of the capture,
+since its frames differ in blur."""
 JOBS = 2
 PEER_TRIES = 2
-"""Number of runs, of which the faster one counts."""
+"""Number of runs, of which the faster counts."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")
 FLOOR_STAGES = ("decode", "shutter", "write")
 PEER_SETTINGS = {"wiener": 0.1, "unsupervised_wiener": 0.0, "richardson_lucy": 30}
 DEEPINV_ROW = "deepinv wiener"
 CAPTURE_S, FPS = 30.0, 30.0
-"""Length of the capture for which the share of estimation, planning included, is reported."""
+"""Length of the capture for which the share of estimation, including planning, is reported."""
 LEAST_S = 1e-5
-"""A stage faster than this is idle."""
+"""A stage faster than this counts as not run."""
 CONTENT = "dead leaves"
-"""What the looped capture shows: the simulator's default scene."""
+"""Content of the looped capture: the simulator's default scene."""
 Facts = dict[str, Any]
 
 
@@ -82,14 +82,14 @@ def speed_section(work: Path, scale: Scale) -> tuple[Facts, str]:
 
 
 def _time_preset(work: Path, capture: Path, name: str, frames: int) -> Facts:
-    """One record: with JOBS processes, and below ``one_process`` with one."""
+    """One record: measured with JOBS processes, and under ``one_process`` with one."""
     one = timed_difference(work, capture, frames // JOBS, "--jobs", "1", *ARGUMENTS[name])
     entry = timed_difference(work, capture, frames, "--jobs", str(JOBS), *ARGUMENTS[name])
     return {"preset": name, **entry, "one_process": one}
 
 
 def timed_difference(work: Path, capture: Path, frames: int, *arguments: str) -> Facts:
-    """Run over N and over 2 N frames; the time per frame from the difference."""
+    """Time per frame, from the difference of runs over N and 2 N frames."""
     return per_frame(_run(work, capture, frames, *arguments), _run(work, capture, 2 * frames, *arguments), frames)
 
 
@@ -101,10 +101,10 @@ def _run(work: Path, capture: Path, frames: int, *arguments: str) -> Run:
 
 
 def per_frame(shorter: Run, longer: Run, frames: int) -> Facts:
-    """Wall-clock and CPU seconds per frame, from runs that differ by ``frames``; stages by the longer run's log.
+    """Wall-clock and CPU seconds per frame, from runs that differ by ``frames``; stages from the longer run's log.
 
-    stage_s is what the workers' clocks say; stage_cpu_s divides the measured CPU time among the stages in proportion.
-    Under load from other processes the longer run may even take less; such a difference gives no rate.
+    stage_s is measured by the workers' clocks; stage_cpu_s divides the CPU time among the stages in proportion.  Under
+    load by other processes the longer run may even take less time; such a difference gives no rate.
     """
     wall_s = (longer.wall_s - shorter.wall_s) / frames
     cpu_s = (longer.timing.cpu_s - shorter.timing.cpu_s) / frames
@@ -129,7 +129,7 @@ def per_frame(shorter: Run, longer: Run, frames: int) -> Facts:
 
 
 def judged(measured: list[Facts], planning_s: float) -> Facts:
-    """Floor and presets, each with its share of the floor and of estimation, and the gain from a second process."""
+    """Floor and presets, each with its share of the floor, its share of estimation and its scaling to two processes."""
     floor = next(entry for entry in measured if entry["preset"] == FLOOR)
     entries = [{**entry, **_shares(entry, floor, planning_s)} for entry in measured]
     pure = floor["straightened"] and floor["deblurred"] == 0.0
@@ -139,10 +139,10 @@ def judged(measured: list[Facts], planning_s: float) -> Facts:
 
 
 def _shares(entry: Facts, floor: Facts, planning_s: float) -> Facts:
-    """Ratios of what was measured.
+    """Ratios of the measured times.
 
-    Figures by CPU time show what a quiet machine allows if no process ever waits; under other load the wall clock
-    cannot show it.  While one process plans, the others are idle, so planning counts in full.
+    Figures by CPU time are what a quiet machine allows if no process ever waits; under other load wall-clock times
+    cannot show this.  While one process plans, the others are idle, so planning counts in full.
     """
     one, stages = entry["one_process"], entry["stage_s"]
     estimate, frames = stages["estimate"] / sum(stages.values()), CAPTURE_S * FPS
@@ -166,7 +166,7 @@ def over(above: float, below: float) -> float | None:
 
 
 def _planning_cpu_s(folder: Path) -> float:
-    """CPU seconds for estimating unknown profile values and checking that frames and gyroscope agree."""
+    """CPU seconds of planning: estimating unknown profile values and checking frames against the gyroscope."""
     prepare_worker()
     capture = read_capture(folder)
     profile, _ = resolve_profile(capture, None)
@@ -186,7 +186,7 @@ def _planning_cpu_s(folder: Path) -> float:
 
 
 def _time_peers(capture: Path) -> dict[str, float]:
-    """CPU seconds for deblurring one colour frame on one thread; no decoding, warping or writing."""
+    """CPU seconds per method for deblurring one colour frame on one thread, without decoding, warping or writing."""
     curve, motions = frame_motions(capture)
     number, picture = next((n, picture) for n, picture in recorded_frames(capture) if n in motions)
     methods = {name: (method, PEER_SETTINGS[name]) for name, (method, _) in PEERS.items()}
@@ -211,7 +211,7 @@ def _cpu_s(work: Callable[[], Any]) -> float:
 
 
 def speed_text(facts: Facts) -> str:
-    """Both tables."""
+    """Tables of the program and of its peers."""
     return _program_text(facts) + "\n\n" + _peers_text(facts)
 
 
@@ -256,7 +256,7 @@ def _peers_text(facts: Facts) -> str:
 
 
 def ratio_to_peer(peer_s: float, entry: Facts) -> float | None:
-    """A peer's CPU time over that of a preset's deblurring, with one process; None if the preset did not deblur."""
+    """A peer's CPU time over that of a preset's deblurring with one process; None if the preset did not deblur."""
     ours_s: float = entry["one_process"]["stage_cpu_s"]["deblur"]
     return peer_s / ours_s if ours_s > LEAST_S else None
 

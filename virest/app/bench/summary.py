@@ -1,4 +1,4 @@
-"""The final table: targets, measured values, and whether they are met."""
+"""Final table: targets, measured values, and whether the targets are met."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ MOST_PROMISE_OFF_DB = 0.5
 LEAST_RATE = {"balanced": 8.0, "best": 0.3}
 MOST_WORKER_MB, MOST_GROWTH = 400.0, 1.05
 MOST_EXPONENT = 1.1
-"""Exponent of the time over frames: with twice as many, each takes at most 7 % more."""
+"""Exponent of the time over frames: with twice as many frames, each takes at most 7 % longer."""
 
 
 YES, NO, BUSY, OPEN = "yes", "NO", "busy", "-"
-"""The last column. ``busy``: not decidable because of load by other processes; ``-``: no target or no measurement."""
+"""Last column.  ``busy``: undecidable because of load by other processes; ``-``: no target or no measurement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +36,11 @@ class Row:
 
 
 def judge(by_wall: bool, by_cpu: bool, others_cores: float, *, ratio: bool = False) -> str:
-    """Whether a target is met, on a machine that other processes may have used too.
+    """Whether a target is met, on a machine that may have been under load by other processes.
 
-    CPU time bounds what a quiet machine can do: a target missed by CPU time is missed.  A wall-clock time that meets
-    the target in spite of other load meets it; a ratio of two such times decides nothing.
+    On a quiet machine wall-clock time decides.  Under load, a target missed by CPU time is missed, since CPU time
+    bounds the performance of a quiet machine; a wall-clock time that meets the target meets it, but a ratio of two
+    wall-clock times decides nothing.
     """
     if others_cores <= BUSY_CORES:
         return YES if by_wall else NO
@@ -49,7 +50,7 @@ def judge(by_wall: bool, by_cpu: bool, others_cores: float, *, ratio: bool = Fal
 
 
 def summary_rows(report: Report) -> list[Row]:
-    """The rows of all sections that were run."""
+    """Rows of all sections that were run."""
     return [row for section, build in SECTIONS.items() if report.get(section) for row in build(report[section])]
 
 
@@ -176,7 +177,7 @@ def _command_row(row: Report) -> Row:
 
 
 def _honesty_rows(honesty: Report) -> list[Row]:
-    """Rows for each set as a whole; the target for the gain applies to the phones."""
+    """Rows for each set as a whole; the gain has a target only for the set of phones."""
     rows: list[Row] = []
     for entry in honesty["summary"]:
         if entry["capture"] is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:
-    """Columns under their heads, the first left-aligned, all others right-aligned."""
+    """Format columns under their headings, the first left-aligned, the others right-aligned."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
 
     def line(row: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Benchmark inputs: simulated captures with truth, looped captures of any length, and runs of the program over them."""
+"""Benchmark inputs: simulated captures with truth, looped captures of any length, and runs of the program on them."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ Picture = NDArray[np.uint8]
 PRESETS = ("fast", "balanced", "best")
 TICKS_PER_S = 90_000
 LOOP_FRAMES = 15
-"""0.5 s at 30 frames/s: the timestamps of a loop are whole microseconds."""
+"""0.5 s at 30 frames/s, so that the loop's length is a whole number of microseconds."""
 GROUP_FRAMES = 30
-"""Frames between key frames, as phones and the simulator write them."""
+"""Frames between key frames, as written by phones and the simulator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Scale:
     kinds: tuple[str, ...] = ()
     """Kinds of capture that ``quality`` measures; empty: all."""
     seeds: int = 100
-    """Number of captures on which calibrations are compared with truth."""
+    """Number of captures in the section ``calibration``."""
     figures: Path | None = None
     """Folder for figures."""
 
@@ -57,13 +57,13 @@ class Scale:
 
 @dataclass(frozen=True, slots=True)
 class Workload:
-    """One simulated capture of the quality table."""
+    """A simulated capture of the quality or honesty table."""
 
     name: str
     kind: str
     """``ordinary``, ``photographs``, ``fine``, ``long``, ``bright``, ``shaken``, ``phone`` or ``defocused``."""
     blur_range_px: tuple[float, float]
-    """Frames whose blur at the centre is in this range count in the means; all count in the minimum."""
+    """Frames with a blur at the centre in this range count in the means; all count in the minimum."""
     options: dict[str, Any] = field(default_factory=dict)
     true_profile: bool = False
     """Process with truth/camera.yaml, so that the camera model has no error."""
@@ -109,14 +109,14 @@ QUICK = ("leaves", "photographs", "long", "bright")
 def _phone(
     name: str, scene: str, exposure_ms: float, rate: float, noise: float, blur_range_px: tuple[float, float], **isp: Any
 ) -> Workload:
-    """640x480 at a phone's bit rate; strengths are set here, independent of the defaults of ``--isp phone``."""
+    """A phone's capture, 640x480; the strengths are set here, independent of the defaults of ``--isp phone``."""
     plain = _workload(f"phone-{name}", "phone", blur_range_px, scene, exposure_ms, rate, noise)
     own = {"readout_ms": PHONE_READOUT_MS, "isp": PhoneIsp(**{**PHONE, **isp})}
     return dataclasses.replace(plain, options={**plain.options, **own})
 
 
 PHONE_READOUT_MS = 12.0
-"""Readout of captures with a wrong stabiliser: at 20 ms wrong straightening, not blur, would dominate the PSNR."""
+"""Readout of phone captures: at 20 ms an unmodelled stabiliser's straightening error would dominate the PSNR."""
 PHONE: dict[str, Any] = {
     "tone": 0.4,
     "highlights": 0.25,
@@ -130,7 +130,7 @@ PHONE: dict[str, Any] = {
     "gyro_jitter_s": 0.0002,
     "gyro_lowpass_hz": 60.0,
 }
-"""Common to all phones: gyroscope noise of 0.01 rad/s at 200 samples/s, before its low pass of 60 Hz."""
+"""Common to all phones: gyroscope noise of 0.01 rad/s at 200 Hz, before its 60 Hz low-pass filter."""
 PHONES = (
     _phone("calm", "text", 12.0, 0.6, 1.5, (1.0, 10.0), offset_s=0.002),
     _phone("fast", "photographs", 16.0, 1.6, 2.0, ORDINARY_PX, offset_s=-0.002),
@@ -153,11 +153,11 @@ SHAKEN = (
     _shaken("noise", "photographs", 14.0, 1.6, 8.0),
     _shaken("lamps", "bright", 14.0, 1.4, 2.0),
 )
-"""Blur of 5 to 45 px, a near plane, strong noise and lights; restored by the gyroscope alone, with neighbours."""
+"""Blur of 5 to 45 px, a near plane, strong noise, clipped highlights; restored from the gyroscope and neighbours."""
 
 
 def quality_workloads(scale: Scale) -> list[Workload]:
-    """Choose the captures of the quality table; with --quick a few small ones of four frames."""
+    """Captures of the quality table; with --quick a few with four frames each."""
     every = [w for w in (*WORKLOADS, *SHAKEN, *PHONES) if w.kind in scale.kinds or not scale.kinds]
     if scale.kinds or not scale.quick:
         return [_shortened(w, 4) for w in every] if scale.quick else every
@@ -176,19 +176,19 @@ DEFOCUSED = (
     _defocused("defocused-fast", "photographs", 12.0, 1.4, 1.8),
     _defocused("defocused-more", "text", 8.0, 1.0, 2.8),
 )
-"""Each with its true profile: a correct model that must not degrade the frames."""
+"""Processed with their true profiles: a correct model must not degrade the frames."""
 SHORT = (
     _workload("short", "ordinary", (0.0, 6.0), "photographs", 8.0, 0.8, 1.5),
     _workload("short-leaves", "ordinary", (0.0, 6.0), "leaves", 9.0, 0.9, 2.0),
     _phone("short", "photographs", 9.0, 0.8, 1.5, (0.0, 6.0)),
     _phone("short-sharp", "leaves", 8.0, 0.9, 1.5, (0.0, 6.0), sharpen=0.8, offset_s=0.002),
 )
-"""Blur of 1 to 5 px, where the possible gain is small and easily overestimated."""
+"""Blur of 1 to 5 px, where the achievable gain is small and easily overestimated."""
 HONEST_QUICK = ("leaves", "phone-fast", "phone-stabilised", "defocused-calm")
 
 
 def honesty_workloads(scale: Scale) -> list[Workload]:
-    """Choose the captures of the honesty table: all kinds, and short blur; with --quick four of six frames."""
+    """Captures of the honesty table: landscape, defocused, phone and short blur; with --quick four, six frames each."""
     every = [*(w for w in WORKLOADS if not w.name.endswith("-p")), *DEFOCUSED, *PHONES, *SHORT]
     return [_shortened(w, 6) for w in every if w.name in HONEST_QUICK] if scale.quick else every
 
@@ -198,7 +198,7 @@ def _shortened(workload: Workload, frames: int) -> Workload:
 
 
 def simulated(work: Path, name: str, **options: Any) -> Path:
-    """Simulate a capture below ``work``; an existing one of that name with the same options is reused."""
+    """Simulate a capture under ``work``; an existing one of that name with the same options is reused."""
     folder = work / "captures" / name
     made_of = folder.with_name(f".{name}.options")
     if not (folder.is_dir() and made_of.is_file() and made_of.read_text(encoding="utf-8") == repr(options)):
@@ -223,10 +223,10 @@ class Timing:
 
 
 def timed(command: list[str]) -> Timing:
-    """Run a command that must succeed; its standard output is discarded."""
+    """Run and time a command, discarding its standard output.  Raises CalledProcessError if it fails."""
     began, before_s = time.perf_counter(), _busy_s()
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        _, status, usage = os.wait4(process.pid, 0)  # includes all descendants that were waited for
+        _, status, usage = os.wait4(process.pid, 0)  # includes all descendants that it has waited for
         process.returncode = os.waitstatus_to_exitcode(status)
     wall_s, cpu_s = time.perf_counter() - began, usage.ru_utime + usage.ru_stime
     if process.returncode:
@@ -235,7 +235,7 @@ def timed(command: list[str]) -> Timing:
 
 
 def _busy_s() -> float:
-    """Seconds that all cores together were busy since the machine's start, and that its host stole."""
+    """Busy seconds of all cores since boot, including time stolen by a virtual machine's host."""
     user, nice, system, _, _, irq, softirq, steal = map(int, Path("/proc/stat").read_text().split()[1:9])
     return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
 
@@ -261,13 +261,13 @@ class Run:
 
 
 def process_command(capture: Path, out: Path, *arguments: str) -> list[str]:
-    """The command line of one quiet run over a capture."""
+    """Command line of one quiet run on a capture."""
     command = [sys.executable, "-m", "virest", "process", str(capture), "--out", str(out), "--overwrite", "-q"]
     return [*command, *arguments]
 
 
 def run_process(capture: Path, out: Path, *arguments: str) -> Run:
-    """Run ``virest process`` as a separate process and read its results."""
+    """Run ``virest process`` as a separate process and read its log."""
     timing = timed(process_command(capture, out, *arguments))
     folder = out / capture.name
     lines = [json.loads(line) for line in (folder / "parameters.jsonl").read_text(encoding="utf-8").splitlines()]
@@ -275,7 +275,7 @@ def run_process(capture: Path, out: Path, *arguments: str) -> Run:
 
 
 def recorded_frames(capture: Path) -> Iterator[tuple[int, Picture]]:
-    """Stream the decoded frames of a capture's movie, RGB."""
+    """Decode the frames of a capture's movie one by one, RGB."""
     movie = capture / "movie.mp4"
     index = probe_movie(movie)
     for number, picture in read_frames(movie, index, 0, len(index) - 1):
@@ -284,7 +284,7 @@ def recorded_frames(capture: Path) -> Iterator[tuple[int, Picture]]:
 
 
 def truth_frame(capture: Path, number: int, folder: str = "frames") -> Picture:
-    """Read the sharp global-shutter picture of a frame, RGB."""
+    """Read the truth of a frame (sharp, global shutter), RGB."""
     return read_png(capture / "truth" / folder / f"{number:06d}.png")
 
 
@@ -300,7 +300,7 @@ def read_png(path: Path) -> Picture:
 
 
 def looped_capture(work: Path, frames: int, width: int = 720, height: int = 1280) -> Path:
-    """Make a capture of any length by repeating frames and gyroscope samples of 0.5 s of a simulated one."""
+    """Make a capture of any length by repeating 0.5 s of frames and gyroscope samples of a simulated one."""
     size = f"{width}x{height}"
     folder = work / "captures" / f"loop{frames}-{size}"
     if folder.is_dir():
@@ -318,7 +318,7 @@ def looped_capture(work: Path, frames: int, width: int = 720, height: int = 1280
 
 
 def _loop_movie(source: Path, folder: Path, frames: int) -> None:
-    """Encode one group of pictures and repeat its packets, so that long movies need no encoding."""
+    """Encode one group of frames and repeat its packets, so that long movies need no encoding."""
     pictures = [picture for _, picture in recorded_frames(source)]
     count = min(frames, GROUP_FRAMES)
     group = folder / "group.mp4"
@@ -339,7 +339,7 @@ def _loop_movie(source: Path, folder: Path, frames: int) -> None:
 
 
 def _loop_table(source: Path, folder: Path, name: str, frames: int) -> None:
-    """Repeat a table with one row per frame and continued timestamps, without its last (Unix) column."""
+    """Repeat a table of one row per frame with continued timestamps, without its last (Unix time) column."""
     head, *rows = [line.split(",")[:-1] for line in (source / name).read_text(encoding="ascii").splitlines()]
     start_ns = int(rows[0][0])
     lines = [",".join(head)]
