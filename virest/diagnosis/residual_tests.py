@@ -69,12 +69,12 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
     found.append(_along_time(left_px, fitted.weight, table.pair))
     strongest = max(found, key=lambda s: s.size)
-    stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.astray)
+    stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.independent_share)
     limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
     beyond = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
     p_noisier, p_stray = _more_than_noise(fitted.distance, table.pair, noise / geometric.step_noise_px)
     noisier = beyond > STRUCTURE_PX and geometric.final_rms_px > SCALE_EXCESS * noise and p_noisier < STRUCTURE_P
-    strays = geometric.astray > STRAY_PART or (stray > STRAY_PART and p_stray < STRUCTURE_P)
+    strays = geometric.independent_share > STRAY_PART or (stray > STRAY_PART and p_stray < STRUCTURE_P)
     log.debug("left: %s, limit %.3f, beyond noise %.3f, stray %.3f", found, limit, beyond, stray)
     if strongest.size > limit and strongest.p_value < STRUCTURE_P:
         sentence = f"residual {strongest.size:.3f} px, strongest along {strongest.along}"
@@ -84,7 +84,7 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
         return Remaining(p_noisier, strongest.along, beyond, GEOMETRY, True, sentence)
     if strays:
         sentence = f"{stray:.0%} of the points move on their own"
-        p_value = None if geometric.astray > STRAY_PART else p_stray
+        p_value = None if geometric.independent_share > STRAY_PART else p_stray
         return Remaining(p_value, "place", strongest.size, GEOMETRY, True, sentence)
     return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, False)
 

@@ -87,7 +87,7 @@ class TrackedPoints:
             return found
         rest = self.observed.without_cells(cells)
         again = self._climbed(replace(rest, noise_px=step_noise_px(rest.pairs)), progress)
-        again.astray = share
+        again.independent_share = share
         again.notes.append(f"{share:.0%} of the points lie in image regions that move independently and were excluded")
         return again
 

@@ -68,7 +68,7 @@ class Scored:
     name: str
     numbers: int
     p_value: float
-    """For the by_block set of forms."""
+    """For the whole set of forms."""
     gain: Array
     """(blocks,) reduction of the squared whitened residual in held-out blocks."""
     parts_gain: Array | None
