@@ -282,7 +282,7 @@ class DiagnosisSession:
         assert self.curve is not None
         assert self.edges is not None
         stages = (self.light, self.blur, self.curve, self.edges)
-        findings = [*self.findings, *(finding for look in stages for finding in look.findings)]
+        findings = [*self.findings, *(finding for stage in stages for finding in stage.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         extended, light = self.curve.profile, self.light
@@ -298,9 +298,7 @@ class DiagnosisSession:
             trajectory = integrate_gyro(self.capture.imu, extended)
             if (soft := blur_field(self.blur.edges, extended, trajectory, self.capture)) is not None:
                 fields, extended = [*fields, soft[0]], soft[1]
-                if not BLUR_LEVELS.matters(
-                    "defocus", extended.extensions.defocus_sigma_px
-                ):  # no uniform defocus is left
+                if not BLUR_LEVELS.matters("defocus", extended.extensions.defocus_sigma_px):  # no uniform blur left
                     findings = [finding for finding in findings if finding.name != "defocus"]
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
@@ -321,9 +319,9 @@ class DiagnosisSession:
             left,
             first.nominal.profile,
             replace(extended, extensions=without_lean),
-            (*self.geometric.rungs, *(rung for look in stages for rung in look.rungs)),
+            (*self.geometric.rungs, *(rung for stage in stages for rung in stage.rungs)),
             {"before": residuals(first, True), "after": residuals(self.geometric, False)},
-            (*self.notes, *self.geometric.notes, *(note for look in stages for note in look.notes)),
+            (*self.notes, *self.geometric.notes, *(note for stage in stages for note in stage.notes)),
             tuple(fields),
         )
 
