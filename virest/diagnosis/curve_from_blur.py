@@ -33,7 +33,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask
-from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
+from virest.diagnosis.photometry_patches import GrayFrame, path_over_exposure, registered_points
 from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
 from virest.image_formation.turning_camera import TurningCamera, turning_camera
 from virest.image_formation.warp import moved_between
@@ -297,8 +297,8 @@ def _compare(
 ) -> list[Array]:
     """Pixels, noise, and for each effect stiffness, scores and rest, (12,) in all, of each usable tile of one pair."""
     height, width = blurred[1].shape[:2]
-    here, there = (Follower(frame, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)) for frame, rgb in (blurred, sharp))
-    where = seen_elsewhere(here, there, camera, _nodes(width, height))
+    here, there = (GrayFrame(frame, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)) for frame, rgb in (blurred, sharp))
+    where = registered_points(here, there, camera, _nodes(width, height))
     if where is None:
         return []
     x, y = ((np.arange(n) / _NODE_PX).astype(np.float32) for n in (width, height))

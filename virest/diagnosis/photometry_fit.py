@@ -199,7 +199,7 @@ def significance(fit: PhotometricFit, effect_name: str, observations: Photometri
 
 
 def _p_of_gains(observations: PhotometricObservations, log_gain: Array, covariance: Array) -> float:
-    """p value of a constant gain, allowing for errors of the gains and for those of curve and encoder when exposure × ISO changes.
+    """p value of a constant gain, given the errors of the gains, and of curve and encoder where exposure × ISO changes.
 
     Frames of one time block share errors, so each block counts once.  Shared errors cancel from one frame to the next,
     so fast changes are tested separately; neighbouring changes share a frame, so one third of them count.
@@ -427,7 +427,7 @@ def _changes(observations: PhotometricObservations, effects: Sequence[Photometri
 
 
 def _exposure_steps(observations: PhotometricObservations, frames: Sequence[int]) -> Array:
-    """Absolute change (k,) of log exposure × ISO at each of some observed frames since the one before; 0 for the first."""
+    """Absolute change (k,) of log exposure × ISO at each of some observed frames since the last; 0 for the first."""
     seen = observations.subset(np.isin(observations.frame, frames))
     product = _per_frame(seen, seen.log_product)
     return np.abs(product - _frames_before(product, 1))
