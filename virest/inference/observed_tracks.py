@@ -78,14 +78,14 @@ class ObservedTracks:
         return self.chosen(use)
 
     def without_astray(self, first_px: Array, distance: Array) -> tuple[ObservedTracks, float]:
-        """Drop image regions that move on their own; also returns the dropped fraction of the points."""
+        """Drop image regions that move independently; also returns the dropped fraction of the points."""
         astray = self.astray_cells(first_px, distance)
         if not astray.any():
             return self, 0.0
         return self.without_cells(astray), float(astray[self.cells(first_px)].mean())
 
     def astray_cells(self, first_px: Array, distance: Array) -> NDArray[np.bool_]:
-        """Mask (CELLS²,) of cells of the picture that move on their own: a dashboard, a passer-by.
+        """Mask (CELLS²,) of cells of the picture that move independently: a dashboard, a passer-by.
 
         first_px (n, 2), distance (n,): points of a fit and their residuals, in standard deviations.  A cell counts if
         its median residual exceeds ASTRAY times the typical cell's; none count if they would hold most points.

@@ -128,7 +128,7 @@ def score_forms(
     """Score forms, best gain first.
 
     left: (n, d) residuals in standard deviations; weight (n,); tangent (n, d, m); block (n,) number of
-    the block of time, rising; time_block (n,) the same for shorter intervals within blocks, on which forms over time
+    the block of time, ascending; time_block (n,) the same for shorter intervals within blocks, on which forms over time
     are tested, because only a few blocks cover each knot.  asked: total number of forms tested; None: these.
     """
     root = np.repeat(np.sqrt(weight), left.shape[1])[:, None]
