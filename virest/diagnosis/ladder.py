@@ -88,7 +88,7 @@ def diagnose_capture(
         capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each
     )
     session.kept_back = frozenset(kept_back)
-    session.begin_description()
+    session.start_field_search()
     say("brightness", 0.5)
     session.judge_light(pictures, gray, profile, lambda part: say("points again", 0.65 + 0.1 * part))
     say("blur", 0.75)
@@ -180,13 +180,13 @@ class DiagnosisSession:
         usable = {frame.index: frame for frame in self.frames_to_fit}
         return tuple(usable.get(frame.index, replace(frame, exposure_s=None)) for frame in self.capture.frames)
 
-    def begin_description(self) -> None:
+    def start_field_search(self) -> None:
         """Start a search for fields in the background, without flicker: no other light changes its result."""
         if isinstance(self.each, Background) and not self.first.fields:
             points = replace(self.points, each=one_by_one)
             self._needs_fields_unlit = begun(self.each, _needs_fields, points, self.first)
 
-    def _described(self, lit: CameraProfile) -> GeometricVerdict:
+    def _with_fields(self, lit: CameraProfile) -> GeometricVerdict:
         """The geometric verdict with the fields that its residuals require under this lighting."""
         own = self.geometric.model.profile
         same = self.geometric is self.first and with_flicker_of(own, lit) == own
@@ -214,7 +214,7 @@ class DiagnosisSession:
                 start=with_flicker_of(start, self.light.profile),
             )
             self.geometric = self.points.climbed(progress)
-        self.geometric = self._described(self.light.profile)
+        self.geometric = self._with_fields(self.light.profile)
         self.findings = offset_as_timestamp(
             self.geometric, findings_of(self.geometric), self.points.observed.exposure_s
         )

@@ -125,15 +125,15 @@ def climb_light(
     each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
     """Find the causes of brightness changes; in a long capture on a run, and per-frame gains then on all frames."""
-    looked = light_stretch(frames)
-    found = climb_photometry(capture, looked, profile, trajectory, rgb, each)
-    if len(looked) == len(frames):
+    run = light_stretch(frames)
+    found = climb_photometry(capture, run, profile, trajectory, rgb, each)
+    if len(run) == len(frames):
         return found
     gains = any(finding.name == "gain_drift" for finding in found.findings)
     if gains and len(frames) <= MAX_GAIN_FRAMES:
         return climb_photometry(capture, frames, profile, trajectory, rgb, each)
-    span = f"frames {looked[0].index} to {looked[-1].index}"
-    note = f"brightness was judged in {len(looked)} of {len(frames)} frames, {span}"
+    span = f"frames {run[0].index} to {run[-1].index}"
+    note = f"brightness was judged in {len(run)} of {len(frames)} frames, {span}"
     found.notes.append(f"{note}; the other frames use the gain of the nearest judged frame" if gains else note)
     return found
 

@@ -43,7 +43,7 @@ class GyroGuide:
     stamp_s: Array
     """(frames,) by movie index, camera clock from stamp_0; NaN if the timestamp or the log is unreliable."""
     exposure_s: Array
-    """(frames,) as logged; 0 where unknown."""
+    """(frames,) as of :func:`virest.inference.observed_tracks.frame_times`."""
 
     def seen_before(self, first: int, second: int, shape: tuple[int, int], factor: int) -> MapBetween | None:
         """The map from points of the second frame to the first; None without timestamps.

@@ -38,7 +38,7 @@ class ObservedTracks:
     stamp_s: Array
     """(frames,) by movie index, camera clock from stamp_0."""
     exposure_s: Array
-    """(frames,) as logged; 0 where unknown."""
+    """(frames,) as logged; missing ones are the median, or 0 if most are missing."""
     exposure_known: bool
     noise_px: Array
     """(pairs,) standard deviation of a step per coordinate."""
@@ -129,7 +129,7 @@ class ObservedTracks:
 
 
 def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile) -> ObservedTracks:
-    """Keep the pairs with enough points and known timestamps; missing exposures are set to the median."""
+    """Keep the pairs with enough points and known timestamps."""
     stamp_s, exposure_s, known = frame_times(capture)
     kept = tuple(
         pair for pair in pairs if len(pair) >= MIN_TRACKS and np.isfinite(stamp_s[[pair.first, pair.second]]).all()
@@ -139,7 +139,10 @@ def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: Camera
 
 
 def frame_times(capture: Capture) -> tuple[Array, Array, bool]:
-    """Timestamps and logged exposures (frames,) by movie index, and whether exposures are known; if not, they are 0."""
+    """(timestamps (frames,) by movie index, exposures (frames,), whether most exposures are logged).
+
+    Missing exposures are the median; if most are missing, all missing ones are 0.
+    """
     stamp_s = np.array([frame.time_s for frame in capture.frames], float)
     exposure_s = np.array([np.nan if f.exposure_s is None else f.exposure_s for f in capture.frames], float)
     known = bool(np.isfinite(exposure_s).mean() > 0.5)
