@@ -10,10 +10,10 @@ from motion.synthetic_tracks import Recording, Setup
 
 from virest.diagnosis.candidates import FarStart, candidates_of
 from virest.diagnosis.cross_validation import (
-    FOLDS,
     FIRST_ITERATIONS,
-    SURVIVORS,
+    FOLDS,
     SURVIVING_STARTS,
+    SURVIVORS,
     best_of_each,
     race,
     screen,

@@ -79,8 +79,8 @@ def screen(evidence: Evidence, candidates: Sequence[Candidate], each: ParallelMa
 def race(evidence: Evidence, candidates: Sequence[Candidate], count: int, each: ParallelMap) -> list[Screened]:
     """Screen many candidates: after a few iterations of all, only the best of either fold are fitted to the end.
 
-    Successive halving (Jamieson & Talwalkar 2016, arXiv:1502.07943).  SURVIVORS × count causes continue, each with up to
-    SURVIVING_STARTS starting points.
+    Successive halving (Jamieson & Talwalkar 2016, arXiv:1502.07943).  SURVIVORS × count causes continue, each with at
+    most SURVIVING_STARTS starting points.
     """
     started = _descended(evidence, [(c, (c.model, c.model)) for c in candidates], FIRST_ITERATIONS, each)
     surviving: set[int] = set()
