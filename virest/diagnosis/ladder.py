@@ -79,26 +79,26 @@ def diagnose_capture(
     kept_back: movie indices of frames excluded from all fits of points, blur and curve.  each: runs calls in parallel;
     gray is then sent to other processes.  Raises CaptureError if too few pairs of frames have trackable points.
     """
-    say = progress or (lambda _text, _part: None)
-    say("tracking", 0.02)
+    report = progress or (lambda _text, _part: None)
+    report("tracking", 0.02)
     points, notes = _tracked(capture, profile, gray, each, frozenset(kept_back))
-    say("points", 0.15)
-    first = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
+    report("points", 0.15)
+    first = points.climbed(lambda part: report("points", 0.15 + 0.35 * part))
     session = DiagnosisSession(
         capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each
     )
     session.kept_back = frozenset(kept_back)
     session.start_field_search()
-    say("brightness", 0.5)
-    session.judge_light(pictures, gray, profile, lambda part: say("points again", 0.65 + 0.1 * part))
-    say("blur", 0.75)
-    session.judge_blur(gray, lambda _part: say("points again", 0.85))
-    say("curve", 0.92)
+    report("brightness", 0.5)
+    session.judge_light(pictures, gray, profile, lambda part: report("points again", 0.65 + 0.1 * part))
+    report("blur", 0.75)
+    session.judge_blur(gray, lambda _part: report("points again", 0.85))
+    report("curve", 0.92)
     session.judge_curve(pictures)
     session.settle_light()
-    say("edges", 0.95)
+    report("edges", 0.95)
     session.judge_edges(gray)
-    say("what is left", 0.97)
+    report("what is left", 0.97)
     return session.conclude()
 
 
