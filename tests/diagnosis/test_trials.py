@@ -9,7 +9,15 @@ import numpy as np
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.diagnosis.candidates import FarStart, candidates_of
-from virest.diagnosis.cross_validation import FOLDS, GLANCE, RACED, RACED_STARTS, best_of_each, race, screen
+from virest.diagnosis.cross_validation import (
+    FIRST_ITERATIONS,
+    FOLDS,
+    SURVIVING_STARTS,
+    SURVIVORS,
+    best_of_each,
+    race,
+    screen,
+)
 from virest.diagnosis.geometric_evidence import ITERATIONS, Model, make_evidence
 from virest.diagnosis.geometric_ladder import SearchContext
 from virest.inference.parallel import one_by_one
@@ -31,8 +39,8 @@ def test_the_right_cause_wins_a_race_as_it_wins_a_screening() -> None:
         return one_by_one(function, calls, done)
 
     raced = best_of_each(race(EVIDENCE, candidates, 1, each))
-    assert iterations.count(GLANCE) == len(FOLDS) * len(candidates)
-    assert 0 < iterations.count(ITERATIONS - GLANCE) <= len(FOLDS) ** 2 * RACED * RACED_STARTS
+    assert iterations.count(FIRST_ITERATIONS) == len(FOLDS) * len(candidates)
+    assert 0 < iterations.count(ITERATIONS - FIRST_ITERATIONS) <= len(FOLDS) ** 2 * SURVIVORS * SURVIVING_STARTS
     assert len(iterations) < 2 * len(FOLDS) * len(candidates)
     right = [candidate for candidate in candidates if candidate.name == "time_offset"]
     screened = best_of_each(screen(EVIDENCE, right, one_by_one))

@@ -30,7 +30,7 @@ JUDGE_POINTS = 3500
 LAGGING_BLOCK = 2
 """Pairs per block among those that a start-up lag moves: only neighbouring pairs share a frame and its errors."""
 
-GLANCE, RACED, RACED_STARTS = 2, 3, 2
+FIRST_ITERATIONS, SURVIVORS, SURVIVING_STARTS = 2, 3, 2
 """Iterations of all candidates in the first round; causes that continue, as a multiple of the count wanted; and
 starting points kept per cause."""
 
@@ -79,18 +79,18 @@ def screen(evidence: Evidence, candidates: Sequence[Candidate], each: ParallelMa
 def race(evidence: Evidence, candidates: Sequence[Candidate], count: int, each: ParallelMap) -> list[Screened]:
     """Screen many candidates: after a few iterations of all, only the best of either fold are fitted to the end.
 
-    Successive halving (Jamieson & Talwalkar 2016, arXiv:1502.07943).  RACED × count causes continue, each with up to
-    RACED_STARTS starting points.
+    Successive halving (Jamieson & Talwalkar 2016, arXiv:1502.07943).  SURVIVORS × count causes continue, each with at
+    most SURVIVING_STARTS starting points.
     """
-    begun = _descended(evidence, [(c, (c.model, c.model)) for c in candidates], GLANCE, each)
-    going: set[int] = set()
+    started = _descended(evidence, [(c, (c.model, c.model)) for c in candidates], FIRST_ITERATIONS, each)
+    surviving: set[int] = set()
     for fold in FOLDS:
         starts: dict[str, list[int]] = {}
-        for k in sorted(range(len(begun)), key=lambda k, f=fold: begun[k].losses[f]):  # type: ignore[misc]
-            starts.setdefault(begun[k].candidate.name, []).append(k)
-        going |= {k for own in list(starts.values())[: RACED * count] for k in own[:RACED_STARTS]}
-    further = [(candidates[k], begun[k].models) for k in sorted(going)]
-    return _descended(evidence, further, ITERATIONS - GLANCE, each)
+        for k in sorted(range(len(started)), key=lambda k, f=fold: started[k].losses[f]):  # type: ignore[misc]
+            starts.setdefault(started[k].candidate.name, []).append(k)
+        surviving |= {k for own in list(starts.values())[: SURVIVORS * count] for k in own[:SURVIVING_STARTS]}
+    remaining = [(candidates[k], started[k].models) for k in sorted(surviving)]
+    return _descended(evidence, remaining, ITERATIONS - FIRST_ITERATIONS, each)
 
 
 def _descended(

@@ -33,7 +33,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask
-from virest.diagnosis.photometry_patches import Follower, path_over_exposure, seen_elsewhere
+from virest.diagnosis.photometry_patches import GrayFrame, path_over_exposure, registered_points
 from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
 from virest.image_formation.turning_camera import TurningCamera, turning_camera
 from virest.image_formation.warp import moved_between
@@ -56,7 +56,7 @@ LEAST_BLACK = 0.01
 FLOOR_QUANTILE, FLOOR_PART = 0.001, 0.5
 """Exclude a black level if this quantile of the greys is below this fraction of it; the margin covers noise and
 undershoots."""
-DOUBT = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
+CODING_STD = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
 """(absolute, relative) σ caused by low-bitrate encoders, in addition to the scatter between pairs of frames."""
 AGREEMENT = 0.07
 """Correlation of coding residuals with a curve change, measured on movies of 0.1 to 0.4 bit per pixel with the
@@ -67,7 +67,7 @@ _MIN_TILE_PIXELS = 400
 _EVERY = 2
 """Pixel spacing of the comparison along both axes; neighbours in a blurred frame are redundant."""
 _NODE_PX = 16
-_AT_AN_END = ((np.arange(256) > 247) | (np.arange(256) < 4)).astype(np.uint8)
+_POSSIBLY_CLIPPED = ((np.arange(256) > 247) | (np.arange(256) < 4)).astype(np.uint8)
 """Mask of the 256 levels that may be clipped."""
 _MAX_CHROMA_RANGE = 40
 """Levels of Cr or Cb within a blur's reach."""
@@ -162,7 +162,7 @@ def observe_mixing(
     settings: MixingSettings | None = None,
     each: ParallelMap = one_by_one,
 ) -> MixingEvidence:
-    """Compare blurred frames with sharp ones near them. Empty where the hand gives no such pairs."""
+    """Compare blurred frames with sharp ones near them. Empty if the motion provides no such pairs."""
     settings = settings or MixingSettings()
     camera = turning_camera(trajectory, profile) if profile.intrinsics is not None else None
     pairs = _choose_pairs(frames, camera, settings) if camera is not None else []
@@ -214,7 +214,7 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
     left_out = np.array([_root(evidence.subset(evidence.pair != k), effect_name) for k in pairs])
     jackknife = (len(pairs) - 1) / len(pairs) * float(np.sum((left_out - left_out.mean()) ** 2))
     strength = float(np.sqrt(evidence.stiffness[effect_name].sum() / evidence.pixels.sum()))
-    absolute, relative = DOUBT[effect_name]
+    absolute, relative = CODING_STD[effect_name]
     std = float(np.sqrt(jackknife + absolute**2 + (AGREEMENT / max(strength, 1e-6)) ** 2))
     p_value = 2 * student_tail(abs(change) / std, len(pairs) - 1)
     std = float(np.hypot(std, relative * change))
@@ -297,8 +297,8 @@ def _compare(
 ) -> list[Array]:
     """Pixels, noise, and for each effect stiffness, scores and rest, (12,) in all, of each usable tile of one pair."""
     height, width = blurred[1].shape[:2]
-    here, there = (Follower(frame, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)) for frame, rgb in (blurred, sharp))
-    where = seen_elsewhere(here, there, camera, _nodes(width, height))
+    here, there = (GrayFrame(frame, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)) for frame, rgb in (blurred, sharp))
+    where = registered_points(here, there, camera, _nodes(width, height))
     if where is None:
         return []
     x, y = ((np.arange(n) / _NODE_PX).astype(np.float32) for n in (width, height))
@@ -422,7 +422,7 @@ def _usable(sharp: Rgb, blurred: Rgb, place: Plane) -> Mask:
 
     def unfit(rgb: Rgb) -> Gray:
         around = np.ones((21, 21), np.uint8)
-        ends = [cv2.LUT(plane, _AT_AN_END) for plane in cv2.split(rgb)]
+        ends = [cv2.LUT(plane, _POSSIBLY_CLIPPED) for plane in cv2.split(rgb)]
         unfit = cv2.dilate(ends[0] | ends[1] | ends[2], around)
         for chroma in cv2.split(cv2.cvtColor(rgb, cv2.COLOR_RGB2YCrCb))[1:]:
             varied = cv2.dilate(chroma, around) - cv2.erode(chroma, around)

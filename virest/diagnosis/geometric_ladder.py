@@ -1,9 +1,9 @@
 """The geometric ladder: stepwise selection of causes that move points, judged on held-out blocks of time.
 
 On each rung every cause is fitted together with those already accepted.  The most promising are then fitted on half of
-the time blocks and judged on the other half, both ways.  The best enters if its gain holds over the blocks (a t test)
-and its value is significant against a deviation that includes the tracker's bias.  All accepted causes are then fitted
-again together, and those no longer significant leave.
+the time blocks and judged on the other half, both ways.  The best enters if its gain is consistent over the blocks (a
+t test) and its value is significant; its standard deviation includes the tracker's bias.  At the end, all accepted
+causes are refitted together, and those no longer significant are removed.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 PROMISING = 3
-"""Number of causes that each fold chooses from."""
+"""Number of causes that each fold may choose from."""
 MAX_P, MIN_GAIN, LARGE_GAIN = POINT_LEVELS.max_p, POINT_LEVELS.least_gain, POINT_LEVELS.evenness[-1][0]
-"""The search for fields uses the levels of the named causes."""
-SMALL_GAIN, ASTRAY_SCALE = 0.1, 1.25
-"""If the best single cause removes less than this part of the loss, while residuals exceed the noise by this factor,
-the fault is elsewhere: causes are then tried in pairs."""
+"""Levels of the named causes; the search for fields uses them too."""
+SMALL_GAIN, EXCESS_SCALE = 0.1, 1.25
+"""Try pairs of causes if the best single cause removes less than this fraction of the loss while the residuals exceed
+the noise by this factor."""
 PAIR_FIRSTS, PAIRS_JUDGED = 8, 4
-"""The best single causes are each tried with all others, which they may hide; the second number is how many pairs each
-fold chooses from."""
+"""Number of best single causes that are each paired with all others, which they may hide; and number of pairs that each
+fold may choose from."""
 RIVAL_T = 2.0
 """A cause is a rival if the blocks prefer the best one by less than this many standard errors."""
-EVEN_T = 0.25
-"""Two rivals are equally good below this many standard errors."""
-PLAINER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length"}
-"""For slow rotations a low pass is a delay; in one image direction a pixel aspect is a focal length.  Where the points
-cannot tell the two apart, the plainer cause is named, with the other as its rival."""
+EQUAL_T = 0.25
+"""Two ends of the ladder are equally good below this many standard errors."""
+SIMPLER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length"}
+"""For slow rotations a low-pass filter is a delay; along one image direction a pixel aspect is a focal length.  Where
+the points cannot distinguish the two, the simpler cause is reported, with the other as its rival."""
 MAX_RUNGS = 5
 
 
@@ -76,11 +76,13 @@ def climb(
     max_rungs: int = MAX_RUNGS,
     each: ParallelMap = one_by_one,
 ) -> GeometricVerdict:
-    """Climb from a profile; null_terms: unknown values, which are fitted on every rung and are not causes.
+    """Climb from a profile.
 
-    lags: the start-up schedules to try.  far: changes of clocks and axes at which the rotations agree.
-    Where a rival might have entered first, the ladder is climbed once more from there, with only the causes of the
-    first climb: any further cause that the rival needs makes it the less simple explanation.
+    null_terms: unknown values; they are fitted on every rung and are not causes.  lags: start-up schedules to try.
+    far: changes of clocks and axes at which frame rotations and gyroscope agree.
+
+    Where a rival could have entered instead, the ladder is climbed once more from there, with only the causes of the
+    first climb: a rival that needs any other cause is the less simple explanation.
     """
     report = progress or (lambda _: None)
     start = Model(nominal, None, tuple(null_terms))
@@ -104,9 +106,9 @@ def climb(
 
 
 def _left_open(context: SearchContext, verdict: GeometricVerdict) -> dict[str, Array]:
-    """Variance that further causes would add to the accepted values, where residuals stay above the noise."""
+    """Variance that further causes would add to the accepted values; empty unless residuals exceed the noise."""
     effects = [entry.effect for entry in verdict.accepted if entry.effect is not None and entry.effect.term is not None]
-    if not effects or verdict.fit.scale < ASTRAY_SCALE:
+    if not effects or verdict.fit.scale < EXCESS_SCALE:
         return {}
     tried = {entry.name for entry in verdict.accepted}
     further = [candidate for candidate in context.candidates(verdict.model, tried) if candidate.added]
@@ -115,14 +117,14 @@ def _left_open(context: SearchContext, verdict: GeometricVerdict) -> dict[str, A
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """The rungs climbed so far, with the model they led to."""
+    """The rungs climbed so far, and the resulting model."""
 
     model: Model
     accepted: tuple[Accepted, ...]
     rungs: tuple[Rung, ...]
 
     def further(self, evidence: Evidence, step: _Step, rung: Rung) -> _Path:
-        """The path with the causes that enter on the next rung."""
+        """The path extended by a rung and the causes that enter on it."""
         model, _ = refitted(evidence, step.model, JUDGE_POINTS)
         log.debug("rung %d: %s", len(self.rungs) + 1, _names(step))
         entered = replace(rung, entered=_names(step))
@@ -130,7 +132,7 @@ class _Path:
 
 
 def _climbed_to_end(context: SearchContext, path: _Path, max_rungs: int) -> tuple[_Path, _Path | None]:
-    """The path to its end, and the path that takes the rival at the first rung that had one."""
+    """Climb to the end; returns (path, path that takes the rival at the first rung that had one, else None)."""
     fork: tuple[_Path, _Step, Rung] | None = None
     while len(path.rungs) < max_rungs:
         step, rival, rung = _rung(context, path.model, list(path.accepted))
@@ -144,12 +146,12 @@ def _climbed_to_end(context: SearchContext, path: _Path, max_rungs: int) -> tupl
 
 
 def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdict) -> GeometricVerdict:
-    """The better of two ends of the ladder by held-out blocks; where they are equal, one with the other as its rival.
+    """The end that predicts held-out blocks better; of two equal ends, one with the other as its rival.
 
-    Which end was reached first may depend on rounding; which is reported must not.  Of two equal ends it is the one
-    with fewer causes; then the one with the lower held-out loss; where the losses differ by less than EVEN_T standard
-    errors, so that rounding may change their order, the names decide.  Two ends with the same causes, which differ
-    only by where their fits stopped, give the first.
+    Rounding may decide which end is reached first, but must not decide which is reported.  Of two equal ends, take the
+    one with fewer causes; then the one with fewer causes that have a simpler alternative (SIMPLER); then the one with
+    the lower held-out loss.  If the losses differ by less than EQUAL_T standard errors, rounding may change their
+    order, so the names decide.  Two ends with the same causes differ only in where their fits stopped: take the first.
     """
     if {entry.name for entry in first.accepted} == {entry.name for entry in second.accepted}:
         return first
@@ -167,8 +169,8 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
         (first, second),
         key=lambda end: (
             len(end.accepted),
-            sum(PLAINER.get(entry.name) is not None for entry in end.accepted),
-            abs(worse) >= EVEN_T and end is not better,
+            sum(SIMPLER.get(entry.name) is not None for entry in end.accepted),
+            abs(worse) >= EQUAL_T and end is not better,
             sorted(e.name for e in end.accepted),
         ),
     )
@@ -194,7 +196,7 @@ def _joined(rivals: Sequence[Rival], more: Sequence[Rival]) -> tuple[Rival, ...]
 
 
 def _with_unknowns(evidence: Evidence, start: Model) -> tuple[Model, list[str]]:
-    """The model with its unknown values fitted; those that end at impossible values keep their initial guess."""
+    """(model with its unknown values fitted, notes); values with an impossible result keep their initial guess."""
     model, notes = refitted(evidence, start, SCREEN_POINTS)[0], []
     at_ends = evidence.impossible(model.profile) - evidence.impossible(start.profile)
     if "readout_time" in evidence.impossible(model.profile):
@@ -203,7 +205,7 @@ def _with_unknowns(evidence: Evidence, start: Model) -> tuple[Model, list[str]]:
     if ended:
         known = tuple(term for term in start.terms if term.name not in ended)
         model = refitted(evidence, replace(start, terms=known), SCREEN_POINTS)[0]
-        notes = [f"{name} is unknown and cannot be told from the points" for name in ended]
+        notes = [f"{name} is unknown and could not be estimated from the points" for name in ended]
     return model, notes
 
 
@@ -223,13 +225,13 @@ class SearchContext:
     """Names of the causes that may enter; None: all."""
 
     def candidates(self, model: Model, tried: set[str]) -> list[Candidate]:
-        """All causes that are not yet in a model."""
+        """All causes that are not in a model yet."""
         found = candidates_of(self.evidence, self.nominal, model, tried, self.lags, self.far)
         found = [entry for entry in found if self.among is None or entry.name in self.among]
         return worth_beginning(self.evidence, model, found)
 
     def judged(self, base: Screened, better: Sequence[Screened], count: int) -> Trial:
-        """The model without and with each promising cause; all losses use the smallest scale, to be comparable."""
+        """Judge the model without and with each promising cause, all at the smallest scale so that losses compare."""
         allowed = promising(base, better, count)
         kept = [entry for entry in better if entry.candidate.name in allowed[0] | allowed[1]]
         scale = min(entry.scale for entry in (base, *kept))
@@ -240,7 +242,7 @@ class SearchContext:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """The model without and with each promising cause, on held-out blocks."""
+    """Held-out losses of the model without and with each promising cause."""
 
     evidence: Evidence
     before: Judged
@@ -250,10 +252,10 @@ class Trial:
     scale: float
 
     def rounds(self) -> Iterator[tuple[Judged, Judged, Array]]:
-        """(cause, result of choosing, gain by block), best first, each time without the causes before it.
+        """Yield (cause, result of choosing, gain (blocks,)), best cause first; each round drops the previous causes.
 
-        The cause is the best over all blocks; the gain it is judged by was chosen for each block from the other blocks.
-        A start-up lag shows in one block only, so it is judged without such a choice.
+        The cause is the best over all blocks.  The gain is that of choosing a cause for each block by the other blocks.
+        A start-up lag shows in one block only, so its gain is measured without such a choice.
         """
         left = sorted(self.judged, key=lambda entry: float(entry.block_loss.mean()))
         while left:
@@ -272,11 +274,11 @@ class _Step:
     model: Model
     accepted: tuple[Accepted, ...]
     part: float
-    """Part of the held-out loss that they remove."""
+    """Fraction of the held-out loss that they remove."""
 
 
 def _rung(context: SearchContext, model: Model, accepted: list[Accepted]) -> tuple[_Step | None, _Step | None, Rung]:
-    """(step that enters, its rival, rung)."""
+    """Climb one rung; returns (step that enters, step of its rival, record of the rung)."""
     tried = {entry.name for entry in accepted}
     nothing = Candidate("", model, (), None)
     base, *others = screen(context.evidence, [nothing, *context.candidates(model, tried)], context.each)
@@ -286,7 +288,7 @@ def _rung(context: SearchContext, model: Model, accepted: list[Accepted]) -> tup
     rung = Rung(None, {j.candidate.name: j.rms * typical for j in trial.judged}, trial.before.rms * typical, GEOMETRY)
     step, rival = _best_single(model, trial)
     small = step is None or step.part < SMALL_GAIN
-    if small and better and min(entry.scale for entry in (base, *better)) > ASTRAY_SCALE:
+    if small and better and min(entry.scale for entry in (base, *better)) > EXCESS_SCALE:
         pair, other = _best_pair(context, model, tried, base, better)
         if pair is not None:
             step, rival = pair, other
@@ -299,7 +301,7 @@ def _names(step: _Step) -> str:
 
 
 def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None]:
-    """The cause with the largest held-out gain, if that gain is significant, and its strongest rival."""
+    """The best cause with a significant gain and value, and its strongest rival."""
     evidence, before, judged = trial.evidence, trial.before, trial.judged
     typical = evidence.typical_px
     for best, after, gain in trial.rounds():
@@ -309,13 +311,13 @@ def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None
         entered, p_value = significant(evidence, best.candidate, model.profile, gain)
         if entered is None:
             continue
-        others = [other for other in judged if other is not best and _rivals(before, best, other, gain)]
-        plainer = [other for other in others if other.candidate.name == PLAINER.get(best.candidate.name)]
-        if plainer:
-            into, p_plainer = significant(evidence, plainer[0].candidate, model.profile, gain)
+        others = [other for other in judged if other is not best and _is_rival(before, best, other, gain)]
+        simpler = [other for other in others if other.candidate.name == SIMPLER.get(best.candidate.name)]
+        if simpler:
+            into, p_simpler = significant(evidence, simpler[0].candidate, model.profile, gain)
             if into is not None:
-                others = [best, *(other for other in others if other is not plainer[0])]
-                best, after, entered, p_value = plainer[0], plainer[0], into, p_plainer
+                others = [best, *(other for other in others if other is not simpler[0])]
+                best, after, entered, p_value = simpler[0], simpler[0], into, p_simpler
         rivals = tuple(Rival(other.candidate.name, other.rms * typical) for other in others)
         cause = Accepted(
             best.candidate.name, best.candidate.effect, best.candidate.word,
@@ -325,14 +327,14 @@ def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None
     return None, None
 
 
-def _rivals(before: Judged, best: Judged, other: Judged, gain: Array) -> bool:
-    """Whether the blocks do not prefer the best to another that gains at least half as much."""
+def _is_rival(before: Judged, best: Judged, other: Judged, gain: Array) -> bool:
+    """Whether another cause gains more than half as much as the best, and the blocks do not clearly prefer the best."""
     apart = t_ratio(other.block_loss - best.block_loss)
     return apart < RIVAL_T and (before.block_loss - other.block_loss).mean() > 0.5 * gain.mean()
 
 
 def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: float) -> _Step | None:
-    """The strongest rival that is significant itself."""
+    """The strongest rival that is itself significant."""
     typical = trial.evidence.typical_px
     for other in sorted(others, key=lambda entry: float(entry.block_loss.mean())):
         gain = trial.before.block_loss - other.block_loss
@@ -349,16 +351,16 @@ def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: floa
 def _best_pair(
     context: SearchContext, model: Model, tried: set[str], base: Screened, better: Sequence[Screened]
 ) -> tuple[_Step | None, _Step | None]:
-    """Two causes that gain together what neither gains alone, while residuals are far above the noise.
+    """The best pair of causes that gain only together, and its strongest rival pair.
 
-    A stabiliser and a clock drift hide each other.
+    For example, a stabiliser and a clock drift hide each other.
     """
     pairs: list[Candidate] = []
     members_of: dict[str, tuple[Candidate, Candidate]] = {}
     done: set[str] = set()
     for first in [entry.candidate for entry in better if entry.candidate.added][:PAIR_FIRSTS]:
         with_it = replace(first.model, terms=(*first.model.terms, *first.added))
-        done |= {first.name}  # A beside B is B beside A
+        done |= {first.name}  # (A, B) and (B, A) are the same pair
         for second in context.candidates(with_it, {*tried, *done}):
             if second.added:
                 name = f"{first.name}{JOINED}{second.name}"
@@ -375,7 +377,7 @@ def _best_pair(
             continue
         step = _pair_step(model, trial, members_of[pair.candidate.name], pair, after)
         if step is not None:
-            others = [other for other in trial.judged if other is not pair and _rivals(before, pair, other, gain)]
+            others = [other for other in trial.judged if other is not pair and _is_rival(before, pair, other, gain)]
             steps = (_pair_step(model, trial, members_of[o.candidate.name], o, o) for o in sorted(others, key=_by_loss))
             return step, next((other for other in steps if other is not None), None)
     return None, None
@@ -388,7 +390,7 @@ def _by_loss(entry: Judged) -> float:
 def _pair_step(
     model: Model, trial: Trial, members: tuple[Candidate, Candidate], pair: Judged, after: Judged
 ) -> _Step | None:
-    """Two causes that enter together, if both are significant beside each other."""
+    """The step for a pair of causes, if each is significant beside the other."""
     evidence, before, typical = trial.evidence, trial.before, trial.evidence.typical_px
     entered, fitted = fitted_with(evidence, pair.candidate)
     p_values = [p_value_of(evidence, fitted, member, entered.profile, model.profile) for member in members]
@@ -399,6 +401,3 @@ def _pair_step(
         for member, p_value in zip(members, p_values, strict=True)
     )
     return _Step(entered, causes, float((before.block_loss - after.block_loss).mean() / before.block_loss.mean()))
-
-
-# ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────

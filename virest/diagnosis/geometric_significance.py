@@ -25,23 +25,23 @@ STABILISER_CUTOFF_HZ = (0.03, 15.0)
 
 
 def refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, TrackFit]:
-    """A model with its terms and scene fitted anew to this many points, its readout the right way round."""
+    """Refit a model's terms and scene to at most this many points; a negative readout becomes a positive one."""
     table = evidence.table(model, points)
     fitted = evidence.fit(model, model.terms, table)
     return replace(model, profile=right_way_round(fitted.profile), scene=fitted.scene), fitted
 
 
 def fitted_with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
-    """The model with the candidate in it, fitted anew."""
+    """Refit the model with the candidate added."""
     return refitted(evidence, replace(candidate.model, terms=(*candidate.model.terms, *candidate.added)), JUDGE_POINTS)
 
 
 def significant(
     evidence: Evidence, candidate: Candidate, before: CameraProfile, gain: Array
 ) -> tuple[Model | None, float]:
-    """(model with the candidate if its value is significant, else None; p-value of the value zero).
+    """(model with the candidate if its value is significant, else None; p value of no change).
 
-    A word has no value: its probability is that of so even a gain (blocks,) by chance.
+    A cause with a word as value has no number to test: its p value is that of such a consistent gain (blocks,).
     """
     model, fitted = fitted_with(evidence, candidate)
     if candidate.name != "scene_depth" and (candidate.effect is None or candidate.effect.term is None):
@@ -57,7 +57,7 @@ def significant(
 def p_value_of(
     evidence: Evidence, fitted: TrackFit, candidate: Candidate, found: CameraProfile, before: CameraProfile
 ) -> float:
-    """P-value of a candidate's value against zero; 1 where no phone has such a value."""
+    """p value of a candidate's value against zero; 1 if no phone has such a value."""
     assert candidate.effect is not None
     return p_if_plausible(evidence, fitted, candidate.effect, found, before)
 
@@ -65,25 +65,25 @@ def p_value_of(
 def p_if_plausible(
     evidence: Evidence, fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile
 ) -> float:
-    """P-value of an effect's value against zero; 1 where it ends at or beyond the bounds of real phones."""
+    """p value of an effect's value against zero; 1 if it ends at or beyond the bounds of real phones."""
     if not is_plausible(evidence, effect, found, effect.total_change(before, found)):
         return 1.0
     return p_of(fitted, effect, found, before, evidence.typical_px)
 
 
 def depth_p(fitted: TrackFit, table: TrackTable, given_m: float | None) -> float:
-    """Probability of so large a change of the inverse depth by chance; 1 where the depth ends at its limits."""
+    """p value of the change in inverse depth; 1 if the depth ends at its limits."""
     depth_m, std = depth_of(fitted, table)
     if not is_depth(depth_m):
         return 1.0
     given_m = given_m or np.inf
     nearer = 1 / depth_m - 1 / given_m
-    certain = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
-    return chi2_tail((nearer / max(certain, 1e-9)) ** 2, 1)
+    inverse_std = std / depth_m**2 if np.isinf(given_m) else np.hypot(std / depth_m**2, KNOWN_DEPTH_STD / given_m)
+    return chi2_tail((nearer / max(inverse_std, 1e-9)) ** 2, 1)
 
 
 def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfile, change: Array) -> bool:
-    """Whether a phone can have such a value: a cause at or beyond these bounds compensates for another."""
+    """Whether a phone can have such a value; a cause at or beyond these bounds compensates for another."""
     if effect.name in evidence.impossible(found):
         return False
     if effect.name == "stabilisation":
@@ -97,11 +97,11 @@ def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfi
 def p_of(
     fitted: TrackFit, effect: GeometricEffect, found: CameraProfile, before: CameraProfile, noise_px: float
 ) -> float:
-    """Probability of so large a change by chance: a chi-square of the change, deviations with tracking's own bias."""
+    """p value of an effect's total change: a chi-square test whose covariance includes the tracker's bias."""
     change = effect.total_change(before, found)
-    floor = bias_std(fitted, effect.name, noise_px)
+    bias = bias_std(fitted, effect.name, noise_px)
     part = fitted.slices[effect.name]
-    covariance = fitted.covariance[part, part] + np.diag(floor**2)
+    covariance = fitted.covariance[part, part] + np.diag(bias**2)
     if effect.name == "stabilisation":
         return chi2_tail(change[0] ** 2 / covariance[0, 0], 1)
     return chi2_tail(change @ np.linalg.solve(covariance, change), len(change))

@@ -46,19 +46,19 @@ class GeometricVerdict:
     nominal_rms_px: float
     final_rms_px: float
     noise_px: float
-    """What tracking alone makes, as an rms like the two above."""
+    """Residual rms due to tracking noise alone, comparable to the two above."""
     step_noise_px: float
     """Typical standard deviation of a tracked step, per coordinate."""
     rival: GeometricVerdict | None = None
-    """Another end of the ladder that held-out points do not tell from this one; None: there is none."""
+    """Another end of the ladder that held-out points cannot distinguish from this one; None: there is none."""
     lag_std_s: float | None = None
-    """Of a start-up lag; None without one."""
-    astray: float = 0.0
-    """Part of the points that lie in parts of the picture that move together on their own, and were left out."""
+    """Standard deviation of a start-up lag; None without one."""
+    independent_share: float = 0.0
+    """Fraction of the points in image regions that move independently; these points were excluded."""
     notes: list[str] = field(default_factory=list)
     fields: list[Any] = field(default_factory=list)
-    """Unknown effects that were found beyond the causes: :class:`virest.diagnosis.field.records.FittedField`."""
+    """Unknown effects found in addition to the causes: :class:`virest.diagnosis.field.records.FittedField`."""
     evidence: Evidence | None = None
     """The pairs that the model was fitted to."""
     left_open: dict[str, Array] = field(default_factory=dict)
-    """Variance (k,) of causes' values, by name, from further causes that points which stay astray leave open."""
+    """By cause: variance (k,) of its values due to further causes, where residuals exceed the noise."""

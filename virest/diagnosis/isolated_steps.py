@@ -1,4 +1,4 @@
-"""Profiles across isolated steps of frames, in grey levels: evidence of edge processing without a camera model."""
+"""Profiles across isolated steps in frames, in grey levels: evidence of edge processing without a camera model."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ Picture = NDArray[np.uint8]
 
 REACH_PX, STEP_PX = 9.0, 0.5
 PLATEAU_PX = 5.0
-"""A profile must be flat beyond this distance, at which an unsharp mask of 2 px has faded."""
+"""A profile must be flat beyond this distance, where the effect of a 2 px unsharp mask has faded."""
 MAX_PLATEAU_RMS = 0.04
-"""Of the plateaus about their levels, as part of the step."""
+"""Maximum rms of a plateau about its level, as a fraction of the step."""
 MIN_STEP_LEVELS = 30.0
 UNCLIPPED_LEVELS = (6.0, 249.0)
 MAX_OFF_PX = 1.0
-"""Between a crest of the slope and the middle of its step."""
+"""Maximum distance between the gradient maximum and the middle of its step."""
 GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)
 _ALONG_PX = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
 
 
 @dataclass(frozen=True, slots=True)
 class IsolatedSteps:
-    """Steps between two flat plateaus, one row a step, of pictures one after another."""
+    """Steps between two flat plateaus, one row per step, in order of frames."""
 
     profile: Array
     """(n, m) on GRID_PX, dark to bright, 0 and 1 at the plateaus, 0.5 at the middle."""
     points_px: Array
-    """(n, 2) the crest of the slope."""
+    """(n, 2) the gradient maximum."""
     normal: Array
     """(n, 2) unit normal, from dark to bright."""
     stamp_s: Array
-    """(n,) the frame's stamp, camera clock."""
+    """(n,) the frame's timestamp, camera clock."""
     exposure_s: Array
     """(n,) as logged."""
 
@@ -46,26 +46,26 @@ class IsolatedSteps:
         return len(self.profile)
 
     def chosen(self, rows: NDArray[np.bool_]) -> IsolatedSteps:
-        """Some of them."""
+        """The steps at a mask."""
         return IsolatedSteps(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 def join_steps(parts: Sequence[IsolatedSteps]) -> IsolatedSteps:
-    """Those of several pictures."""
+    """Concatenate the steps of several frames."""
     if not parts:
         return IsolatedSteps(np.zeros((0, len(GRID_PX))), *(np.zeros((0, 2)) for _ in range(2)), *np.zeros((2, 0)))
     return IsolatedSteps(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(IsolatedSteps)))
 
 
 def isolated_steps(picture: Picture, frame: Frame, points_px: Array, normals: Array) -> IsolatedSteps:
-    """The isolated ones among a picture's edges (n, 2), (n, 2), as `find_edges` gives them; frame: with an exposure."""
+    """The isolated steps among a frame's edges (n, 2), (n, 2) from `find_edges`; frame: with an exposure."""
     profile, kept = _isolated(parallel_profiles(picture, points_px, normals, _ALONG_PX))
     times = ((time_s or 0.0) * np.ones(len(kept)) for time_s in (frame.time_s, frame.exposure_s))
     return IsolatedSteps(profile, points_px[kept], normals[kept], *times)
 
 
 def crossing(part: Array, level: float, along_px: Array) -> Array:
-    """(n,) where profiles first rise to a level, linear between samples."""
+    """(n,) position where each profile first reaches a level, by linear interpolation."""
     if not len(part):
         return np.zeros(0)
     after = np.maximum(np.argmax(part >= level, axis=1), 1)
@@ -76,7 +76,7 @@ def crossing(part: Array, level: float, along_px: Array) -> Array:
 
 
 def _isolated(levels: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Steps between two flat plateaus, as part of their height, middle at 0: (n, m) on GRID_PX; and which they are."""
+    """(profiles (n, m) on GRID_PX of the isolated steps, normalised by step height, middle at 0; their indices)."""
     low, high = UNCLIPPED_LEVELS
     kept = np.flatnonzero((levels.min(axis=1) > low) & (levels.max(axis=1) < high))
     levels = levels[kept]
@@ -94,7 +94,7 @@ def _isolated(levels: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _moved(part: Array, middle: Array) -> Array:
-    """Profiles with their middles at 0, on GRID_PX, linear between samples."""
+    """Profiles resampled on GRID_PX with their middles at 0, by linear interpolation."""
     at = (GRID_PX + middle[:, None] - _ALONG_PX[0]) / STEP_PX
     index = np.clip(at.astype(np.intp), 0, len(_ALONG_PX) - 2)
     share = at - index

@@ -61,7 +61,8 @@ from virest.motion.scene_motion import InertialMotion
 
 Progress = Callable[[str, float], None]
 MOST_TRAVEL_PX = 0.35
-"""A tenth of the shortest blur that the curve is estimated from: such travel rotates no blur path by more than that."""
+"""Maximum path length from camera translation: a tenth of the shortest blur that the curve is estimated from, so that
+translation rotates a blur path by at most 0.1 rad."""
 
 
 def diagnose_capture(
@@ -73,39 +74,41 @@ def diagnose_capture(
     each: ParallelMap = one_by_one,
     kept_back: Collection[int] = (),
 ) -> Diagnosis:
-    """Climb the ladder on one capture; pictures gives (index, RGB), gray (index, luma) of the frames asked for.
+    """Climb the ladder on one capture; pictures yields (index, RGB), gray (index, luma) of the requested frames.
 
-    kept_back: movie indices of frames that no fit of points, blur or curve is to see.  each: shares work out; gray then
-    goes to other processes.  Raises CaptureError where there is nothing to judge by: too few points.
+    kept_back: movie indices of frames excluded from all fits of points, blur and curve.  each: runs calls in parallel;
+    gray is then sent to other processes.  Raises CaptureError if too few pairs of frames have trackable points.
     """
-    say = progress or (lambda _text, _part: None)
-    say("tracking", 0.02)
+    report = progress or (lambda _text, _part: None)
+    report("tracking", 0.02)
     points, notes = _tracked(capture, profile, gray, each, frozenset(kept_back))
-    say("points", 0.15)
-    first = points.climbed(lambda part: say("points", 0.15 + 0.35 * part))
-    story = DiagnosisSession(capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each)
-    story.kept_back = frozenset(kept_back)
-    story.begin_description()
-    say("brightness", 0.5)
-    story.judge_light(pictures, gray, profile, lambda part: say("points again", 0.65 + 0.1 * part))
-    say("blur", 0.75)
-    story.judge_blur(gray, lambda _part: say("points again", 0.85))
-    say("curve", 0.92)
-    story.judge_curve(pictures)
-    story.settle_light()
-    say("edges", 0.95)
-    story.judge_edges(gray)
-    say("what is left", 0.97)
-    return story.told()
+    report("points", 0.15)
+    first = points.climbed(lambda part: report("points", 0.15 + 0.35 * part))
+    session = DiagnosisSession(
+        capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each
+    )
+    session.kept_back = frozenset(kept_back)
+    session.start_field_search()
+    report("brightness", 0.5)
+    session.judge_light(pictures, gray, profile, lambda part: report("points again", 0.65 + 0.1 * part))
+    report("blur", 0.75)
+    session.judge_blur(gray, lambda _part: report("points again", 0.85))
+    report("curve", 0.92)
+    session.judge_curve(pictures)
+    session.settle_light()
+    report("edges", 0.95)
+    session.judge_edges(gray)
+    report("what is left", 0.97)
+    return session.conclude()
 
 
 def _tracked(
     capture: Capture, profile: CameraProfile, gray: Reader, each: ParallelMap, kept_back: frozenset[int]
 ) -> tuple[TrackedPoints, list[str]]:
-    """Points of the frames that are followed, those of the start-up too; pairs with a frame kept back are left out."""
+    """(points tracked in the frames to follow, including the start-up, without held-back frames; notes)."""
     indices = frames_to_follow(capture, profile)
     observed = observe_tracks(capture, track_guided(capture, profile, gray, indices, each), profile)
-    observed = _seen(observed, capture, profile, kept_back)
+    observed = _without_held_back(observed, capture, profile, kept_back)
     start, null_terms, notes, far, follows = with_null_values(observed, capture, profile)
     observed = observed.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
@@ -128,12 +131,12 @@ def _tracked(
     return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed, each), notes
 
 
-def _seen(
+def _without_held_back(
     observed: ObservedTracks, capture: Capture, profile: CameraProfile, kept_back: frozenset[int]
 ) -> ObservedTracks:
-    """The pairs without the frames that are kept back, but for those in doubtful stretches of the log.
+    """The pairs without held-back frames, except those in doubtful log intervals, if enough pairs lie outside these.
 
-    These take no part in the ladder, and nothing but their own points can bridge the stretch.
+    The excepted pairs take no part in the ladder, and only their own points can bridge the interval.
     """
     seen = np.array([not kept_back & {pair.first, pair.second} for pair in observed.pairs], bool)
     hit = doubtful_pairs(observed, capture, profile).hit
@@ -142,82 +145,82 @@ def _seen(
 
 @dataclass(slots=True)
 class DiagnosisSession:
-    """What has been found so far."""
+    """State of one diagnosis, advanced stage by stage."""
 
     capture: Capture
     points: TrackedPoints
     first: GeometricVerdict
-    """Before light was known."""
+    """Verdict before the photometric stage."""
     geometric: GeometricVerdict
     light: PictureVerdict
     blur: PictureVerdict | None = None
     curve: PictureVerdict | None = None
     edges: PictureVerdict | None = None
     findings: list[Finding] = field(default_factory=list)
-    """Of the points, and what blur made of them."""
+    """Causes found in the points, as revised by the blur stage."""
     notes: list[str] = field(default_factory=list)
     each: ParallelMap = one_by_one
     kept_back: frozenset[int] = frozenset()
-    """Movie indices of frames that only brightness is to see."""
-    _asks_unlit: Callable[[], bool] | None = None
-    """Whether the points of the first verdict ask for fields, if light does not pulse; None: nobody has looked."""
+    """Movie indices of frames that only the photometric stage may use."""
+    _needs_fields_unlit: Callable[[], bool] | None = None
+    """Returns whether the points of the first verdict require fields without flicker; None: not started."""
 
     @property
     def frames(self) -> list[Frame]:
-        """Frames that can be looked at, with the stamps that the first model gives them."""
+        """Usable frames, with the timestamps of the first model."""
         return at_model_times(self.capture, self.first)
 
     @property
     def frames_to_fit(self) -> list[Frame]:
-        """Those that blur and curve are fitted to."""
+        """Frames that blur and curve are fitted to."""
         return [frame for frame in self.frames if frame.index not in self.kept_back]
 
     def _all_frames(self) -> tuple[Frame, ...]:
-        """Every frame, by movie index; those that cannot be looked at without an exposure."""
+        """Every frame, by movie index; unusable and held-back frames have no exposure."""
         usable = {frame.index: frame for frame in self.frames_to_fit}
         return tuple(usable.get(frame.index, replace(frame, exposure_s=None)) for frame in self.capture.frames)
 
-    def begin_description(self) -> None:
-        """Have another process look for fields meanwhile: of the light, lamps' pulses alone make a difference."""
+    def start_field_search(self) -> None:
+        """Start a search for fields in the background, without flicker: no other light changes its result."""
         if isinstance(self.each, Background) and not self.first.fields:
             points = replace(self.points, each=one_by_one)
-            self._asks_unlit = begun(self.each, _asks_for_fields, points, self.first)
+            self._needs_fields_unlit = begun(self.each, _needs_fields, points, self.first)
 
-    def _described(self, lit: CameraProfile) -> GeometricVerdict:
-        """The verdict of the points with the fields that they ask for under this light."""
+    def _with_fields(self, lit: CameraProfile) -> GeometricVerdict:
+        """The geometric verdict with the fields that its residuals require under this lighting."""
         own = self.geometric.model.profile
         same = self.geometric is self.first and with_flicker_of(own, lit) == own
-        if same and self._asks_unlit is not None and not self._asks_unlit():
+        if same and self._needs_fields_unlit is not None and not self._needs_fields_unlit():
             return self.geometric
         return self.points.described(self.geometric, lit)
 
     def judge_light(
         self, pictures: Reader, gray: Reader, given: CameraProfile, progress: Callable[[float], None]
     ) -> None:
-        """Brightness; where it pulses, and points still go astray, they are followed again in pictures without that."""
+        """Judge brightness; if the lighting changes and point residuals are significant, track again without it."""
         frames, moved = self.frames, self.geometric.model.profile
         trajectory = integrate_gyro(self.capture.imu, moved)
         self.light = climb_light(self.capture, frames, moved, trajectory, pictures, self.each)
         if points_left(self.geometric).significant and lighting_changes(self.light.profile):
-            even = without_lighting_changes(gray, frames, self.light.profile)
+            corrected = without_lighting_changes(gray, frames, self.light.profile)
             followed = set(frames_to_follow(self.capture, given)) & {frame.index for frame in frames}
             guide = find_guide(self.capture, given, gray, sorted(followed))
-            again = observe_tracks(self.capture, track_pairs(even(sorted(followed)), guide=guide), given)
-            again = _seen(again, self.capture, given, self.kept_back)
+            retracked = observe_tracks(self.capture, track_pairs(corrected(sorted(followed)), guide=guide), given)
+            retracked = _without_held_back(retracked, self.capture, given, self.kept_back)
             start = self.points.start
             self.points = replace(
                 self.points,
-                observed=again.covered(self.capture.imu, start),
+                observed=retracked.covered(self.capture.imu, start),
                 start=with_flicker_of(start, self.light.profile),
             )
             self.geometric = self.points.climbed(progress)
-        self.geometric = self._described(self.light.profile)
+        self.geometric = self._with_fields(self.light.profile)
         self.findings = offset_as_timestamp(
             self.geometric, findings_of(self.geometric), self.points.observed.exposure_s
         )
 
     def judge_blur(self, gray: Reader, progress: Callable[[float], None]) -> None:
-        """Blur, where points go where the model says; it tells an exposure's length from an offset."""
+        """Judge blur unless point residuals are significant; blur distinguishes a wrong exposure from a time offset."""
         self.blur = PictureVerdict(self.light.profile)
         exposure_s = self.points.observed.exposure_s
         scale, is_exposure = exposure_hypothesis(self.findings, exposure_s), False
@@ -242,7 +245,7 @@ class DiagnosisSession:
         self.curve = PictureVerdict(extended)
 
     def judge_curve(self, pictures: Reader) -> None:
-        """The curve from what blur mixes, where the paths of blur are sure."""
+        """Estimate the curve from how blur mixes light, where the blur paths are accurate."""
         assert self.curve is not None
         extended = self.curve.profile
         if points_left(self.geometric).significant:
@@ -258,7 +261,7 @@ class DiagnosisSession:
         self.curve = judge_curve(extended, self.light.observations, frames, trajectory, pictures, self.each)
 
     def settle_light(self) -> None:
-        """Brightness's values once more, now that the curve and the exposure are known as well as they will be."""
+        """Refit the photometric values under the final curve and exposure."""
         assert self.blur is not None
         assert self.curve is not None
         causes = [*self.findings, *self.blur.findings]
@@ -266,20 +269,20 @@ class DiagnosisSession:
         self.curve = replace(self.curve, profile=profile)
 
     def judge_edges(self, gray: Reader) -> None:
-        """What the phone did to its edges; no blur overshoots, so the paths need not be right."""
+        """Detect sharpening by the phone; no blur overshoots, so the blur paths need not be accurate."""
         assert self.blur is not None
         assert self.curve is not None
         shown, extended = replace(self.capture, frames=self._all_frames()), self.curve.profile
         trajectory = integrate_gyro(self.capture.imu, extended)
         self.edges = judge_sharpening(shown, extended, trajectory, gray, self.each, self.blur.steps)
 
-    def told(self) -> Diagnosis:
-        """The verdict, with everything that led to it."""
+    def conclude(self) -> Diagnosis:
+        """The diagnosis, assembled from all stages."""
         assert self.blur is not None
         assert self.curve is not None
         assert self.edges is not None
-        looks = (self.light, self.blur, self.curve, self.edges)
-        findings = [*self.findings, *(finding for look in looks for finding in look.findings)]
+        stages = (self.light, self.blur, self.curve, self.edges)
+        findings = [*self.findings, *(finding for stage in stages for finding in stage.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         extended, light = self.curve.profile, self.light
@@ -295,15 +298,15 @@ class DiagnosisSession:
             trajectory = integrate_gyro(self.capture.imu, extended)
             if (soft := blur_field(self.blur.edges, extended, trajectory, self.capture)) is not None:
                 fields, extended = [*fields, soft[0]], soft[1]
-                if not BLUR_LEVELS.matters("defocus", extended.extensions.defocus_sigma_px):  # no even one is left
+                if not BLUR_LEVELS.matters("defocus", extended.extensions.defocus_sigma_px):  # no uniform blur left
                     findings = [finding for finding in findings if finding.name != "defocus"]
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
         stated = [entry for field in fields for entry in field.fields]
         with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in extended.fields]
         extended = extended.with_fields([held.rounded() for held in with_std])
-        # a lens's lean belongs to the start of this log; a process that begins later must not have it
-        unleaning = replace(extended.extensions, stabilisation_lean_rad=(0.0, 0.0))
+        # the stabiliser's lean belongs to the start of this log: a restoration that begins later must not use it
+        without_lean = replace(extended.extensions, stabilisation_lean_rad=(0.0, 0.0))
         stamps = sum(NO_STAMP not in frame.skip_codes for frame in self.capture.frames)
         nominal = Nominal(
             first.nominal_rms_px, first.noise_px, self.light.photometric_rms, self.blur.blur_rms_px,
@@ -315,27 +318,30 @@ class DiagnosisSession:
             tuple(findings),
             left,
             first.nominal.profile,
-            replace(extended, extensions=unleaning),
-            (*self.geometric.rungs, *(rung for look in looks for rung in look.rungs)),
+            replace(extended, extensions=without_lean),
+            (*self.geometric.rungs, *(rung for stage in stages for rung in stage.rungs)),
             {"before": residuals(first, True), "after": residuals(self.geometric, False)},
-            (*self.notes, *self.geometric.notes, *(note for look in looks for note in look.notes)),
+            (*self.notes, *self.geometric.notes, *(note for stage in stages for note in stage.notes)),
             tuple(fields),
         )
 
 
-def _asks_for_fields(points: TrackedPoints, found: GeometricVerdict) -> bool:
+def _needs_fields(points: TrackedPoints, found: GeometricVerdict) -> bool:
     return bool(points.described(found, found.model.profile).fields)
 
 
 def _paths_uncertain(profile: CameraProfile, geometric: GeometricVerdict) -> bool:
-    """Whether blur depends on more than rotation: mixing by blur then says little about the curve."""
+    """Whether blur depends on more than rotation; light mixing then says little about the curve."""
     extensions = profile.extensions
     moved = bool(extensions.stabilisation_fraction or extensions.defocus_sigma_px)
     return moved or travel_blur_px(geometric) > MOST_TRAVEL_PX
 
 
 def travel_blur_px(geometric: GeometricVerdict) -> float:
-    """Path length of points by the camera's translation within an exposure, px: its 90th percentile over all points."""
+    """90th percentile over the points of the path that camera translation adds within an exposure, px.
+
+    0 without translation in the model; infinite if the translation is not inertial.
+    """
     fitted, table = geometric.fit, geometric.table
     if geometric.model.scene is None:
         return 0.0

@@ -23,8 +23,8 @@ from virest.inference.parallel import ParallelMap
 from virest.inference.track_fit import TrackFit
 
 Array = NDArray[np.float64]
-ASIDE = 3.0
-"""The model's own fit is repeated from this many standard deviations on either side."""
+RESTART_SIGMA = 3.0
+"""Repeat the model's own fit from this many standard deviations on either side."""
 Plausible = Callable[[Evidence, GeometricEffect, CameraProfile, Array], bool]
 
 
@@ -36,36 +36,36 @@ def variance_left_open(
     plausible: Plausible,
     each: ParallelMap,
 ) -> dict[str, Array]:
-    """Variance (k,) of the values of a model's effects due to causes outside the model, by effect name.
+    """By effect: variance (k,) of its values due to causes outside the model.
 
     further: causes that may be added, at all their starting points.  plausible: whether a phone can have such a value.
     """
     table = evidence.table(model, SCREEN_POINTS)
     base = fit_model(evidence.imu, model, model.terms, table)
-    aside = _aside(model, effects, base)
-    calls = [(evidence.imu, start, model.terms, table) for start in aside]
+    restarts = _restarts(model, effects, base)
+    calls = [(evidence.imu, start, model.terms, table) for start in restarts]
     calls += [(evidence.imu, c.model, (*c.model.terms, *c.added), table) for c in further]
     fits = each(fit_model, calls)
-    others = [fitted for fitted in fits[: len(aside)] if fitted.cost <= base.cost]
+    others = [fitted for fitted in fits[: len(restarts)] if fitted.cost <= base.cost]
     best: dict[str, TrackFit] = {}
-    for candidate, fitted in zip(further, fits[len(aside) :], strict=True):
+    for candidate, fitted in zip(further, fits[len(restarts) :], strict=True):
         effect, name = candidate.effect, candidate.name
         if effect is None or fitted.cost >= best.get(name, base).cost:
             continue
         if plausible(evidence, effect, fitted.profile, effect.total_change(model.profile, fitted.profile)):
             best[name] = fitted
-    return {effect.name: _spread(base, others, list(best.values()), effect) for effect in effects}
+    return {effect.name: _added_variance(base, others, list(best.values()), effect) for effect in effects}
 
 
-def _aside(model: Model, effects: Sequence[GeometricEffect], fitted: TrackFit) -> list[Model]:
-    """The model with each value of its causes moved to either side, all others following by their covariance."""
+def _restarts(model: Model, effects: Sequence[GeometricEffect], fitted: TrackFit) -> list[Model]:
+    """Models with one value of a cause moved to either side; the other values follow by their covariance."""
     starts = []
     for effect in effects:
         assert effect.term is not None
         part = fitted.slices[effect.term.name]
         for k in range(part.start, part.stop):
             step = fitted.covariance[k] / np.sqrt(max(fitted.covariance[k, k], np.finfo(float).tiny))
-            starts += [_moved(model, fitted, side * ASIDE * step) for side in (1.0, -1.0)]
+            starts += [_moved(model, fitted, side * RESTART_SIGMA * step) for side in (1.0, -1.0)]
     return starts
 
 
@@ -76,8 +76,10 @@ def _moved(model: Model, fitted: TrackFit, step: Array) -> Model:
     return replace(model, profile=profile)
 
 
-def _spread(base: TrackFit, others: Sequence[TrackFit], wider: Sequence[TrackFit], effect: GeometricEffect) -> Array:
-    """Variance (k,): the widest of the model's own ends, and what each further cause adds to it."""
+def _added_variance(
+    base: TrackFit, others: Sequence[TrackFit], wider: Sequence[TrackFit], effect: GeometricEffect
+) -> Array:
+    """Variance (k,): the largest squared shift among the model's own refits, plus the excess of each further cause."""
     own = [effect.total_change(base.profile, other.profile) ** 2 for other in others]
     freedom = [np.maximum(_variance(other, effect) - _variance(base, effect), 0.0) for other in wider]
     moved = [effect.total_change(base.profile, other.profile) ** 2 for other in wider]

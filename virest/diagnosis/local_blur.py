@@ -61,83 +61,84 @@ Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
 LENS_SIGMA_PX = 0.70
 """Width of a sharp edge in a decoded frame, from lens, pixel and coding; defocus is the excess."""
 LENS_STD_PX = 0.13
-"""Its spread: coding at 0.15 bit a pixel alone widens edges from 0.70 to 0.85 px."""
+"""Its standard deviation: coding at 0.15 bit per pixel alone widens edges from 0.70 to 0.85 px."""
 DAMPING = (0.92, 0.84)
-"""Part of a log ratio that survives coding, in each ring of frequencies."""
+"""Fraction of a log ratio that survives coding, per frequency ring."""
 DAMPING_STD = 0.13
-"""Its spread: more is lost under defocus, less at 1 bit a pixel and for strong edges."""
+"""Its standard deviation: more is lost under defocus, less at 1 bit per pixel and for strong edges."""
 STARVED_BITS, STARVED_STD = 0.1, 0.35
-"""Bits a pixel at which another half is lost, and how much scenes differ in it (natural logarithm).  At 0.1 to 0.15 bit
-a pixel 0.5 to 0.9 of what survives at higher rates was left, at 0.2 bit 0.9."""
+"""Bits per pixel at which half of the remaining log ratio is lost too, and standard deviation of this between scenes
+(natural logarithm).  At 0.1 to 0.15 bit per pixel, 0.5 to 0.9 of what survives at higher rates was left; at 0.2 bit,
+0.9."""
 STILL_PX = 0.4
-"""Edges across which the path's standard deviation is below this are measured."""
+"""Measure edges across which the path's standard deviation is below this."""
 MIN_TRANSFER = 0.25
-"""Bins whose |K|² is predicted below this are noise."""
+"""Bins with a predicted |K|² below this are noise."""
 PARTS = 4
 """Number of parts in which the frames may be measured in parallel."""
 PAIR_FRAMES = 4
-"""Distance of the two frames of a pair: the camera has rotated, the patch is still in view."""
+"""Frames from the first to the second of a pair: the camera has rotated, but the patch is still in view."""
 MIN_EDGES = 40
 MIN_ACCEPTED = 0.004
-"""Least part of the strong gradients that are isolated steps: in a smooth scene next to none are."""
+"""Minimum fraction of the strong gradients that are isolated steps; a smooth scene has almost none."""
 MIN_RATIOS = 400
 MIN_CONTRAST = 0.06
-"""Least rms of the predicted log ratios: frames with equal motion do not determine the exposure."""
+"""Minimum rms of the predicted log ratios: frames with equal motion do not determine the exposure."""
 BLOCKS = 8
 """Number of time blocks; measurements within a block share errors."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlurObservations:
-    """What the pictures show of local blur; rows of residuals are edges first, then the bins of the ratios."""
+    """Local blur measured in the frames; residuals are ordered edges first, then the bins of the ratios."""
 
     edges: EdgeWidths
     ratios: SpectrumRatios
     candidates: int
-    """Strong slopes that were tried as edges, across which the picture hardly moved or not."""
+    """Number of strong gradients tested as edges, whether or not the image moved across them."""
     isolated: int
-    """Those of them that are isolated steps."""
+    """Number of these that are isolated steps."""
     bits_per_px: float = inf
-    """What the encoder spent on a pixel."""
+    """Bit rate of the movie."""
     steps: IsolatedSteps | None = None
-    """Of the same pictures, in grey levels; None: not looked for."""
+    """Isolated steps of the same frames, in grey levels; None: not measured."""
 
     def __len__(self) -> int:
         return len(self.edges) + int(self.valid.sum())
 
     @property
     def valid(self) -> Mask:
-        """(n, b) which bins of which tiles were measured."""
+        """(n, b) mask of the measured bins of each tile."""
         return np.isfinite(self.ratios.log_ratio)
 
     @property
     def time_s(self) -> Array:
-        """Stamp of each residual's frame, camera clock; of the first of a pair."""
+        """Timestamp of each residual's frame, camera clock; for ratios, of the pair's first frame."""
         tile, _ = np.nonzero(self.valid)
         return np.concatenate([self.edges.stamp_s, self.ratios.stamp_s[tile, 0, 0]])
 
     @property
     def is_edge(self) -> Mask:
-        """Which residuals are edges."""
+        """Mask of the residuals that are edges."""
         return np.arange(len(self)) < len(self.edges)
 
     @property
     def surviving(self) -> float:
-        """Part of DAMPING that the encoder's bits let through."""
+        """Fraction of DAMPING that survives at this bit rate."""
         return 1.0 / (1.0 + (STARVED_BITS / self.bits_per_px) ** 3)
 
     @property
     def damping_std(self) -> float:
-        """Relative standard deviation of what comes through."""
+        """Relative standard deviation of what survives coding."""
         return float(np.hypot(DAMPING_STD, 3.0 * (1.0 - self.surviving) * STARVED_STD))
 
     @property
     def edges_determined(self) -> bool:
-        """Whether the scene has enough isolated steps to tell a defocused picture from a picture of smooth things."""
+        """Whether the scene has enough isolated steps to distinguish a defocused image from smooth content."""
         return len(self.edges) >= MIN_EDGES and self.isolated >= MIN_ACCEPTED * self.candidates
 
     def covariates(self, profile: CameraProfile, trajectory: Trajectory) -> dict[str, Array]:
-        """What a structure in the residuals may run along, one value a residual."""
+        """Covariates of the residuals, one value per residual."""
         tile, _ = np.nonzero(self.valid)
         e, r = self.edges, self.ratios
         stamps, exposures = (
@@ -150,7 +151,7 @@ class BlurObservations:
 
 
 def frames_to_read(capture: Capture, pairs: int = 22) -> list[int]:
-    """Movie indices for :func:`observe_blur`: pairs of frames, evenly over the capture."""
+    """Movie indices for :func:`observe_blur`: pairs of frames, evenly spaced over the capture."""
     known = {f.index for f in capture.frames if f.exposure_s and (f.skip_reason is None or f.only_startup)}
     starts = [k for k in sorted(known) if k + PAIR_FRAMES in known]
     picked = np.linspace(0, len(starts) - 1, min(pairs, len(starts))).round().astype(int)
@@ -164,7 +165,7 @@ def look_for_blur(
     trajectory: Trajectory,
     each: ParallelMap = one_by_one,
 ) -> BlurObservations:
-    """Measure the frames of :func:`frames_to_read` of a capture, part by part; the same as in one stream of them."""
+    """Measure the frames of :func:`frames_to_read` part by part; the result is that of one stream."""
     wanted, curve = frames_to_read(capture), profile.response or ResponseCurve("srgb")
     parts = _parts(wanted)
     early = [[k for k in wanted if part[0] - PAIR_FRAMES <= k < part[0]] if part else [] for part in parts]
@@ -178,7 +179,7 @@ def look_for_blur(
 def look_for_steps(
     gray: Callable[[Sequence[int]], Stream], capture: Capture, each: ParallelMap = one_by_one
 ) -> IsolatedSteps:
-    """The isolated steps of the frames of :func:`frames_to_read`, as :func:`look_for_blur` sees them."""
+    """The isolated steps in the frames of :func:`frames_to_read`, as :func:`look_for_blur` finds them."""
     parts = _parts(frames_to_read(capture))
     seen = each(_steps_of_part, [(gray, part, capture.frames) for part in parts])
     return join_steps([one for part in seen for one in part])
@@ -211,9 +212,9 @@ def observe_blur(
     trajectory: Trajectory,
     settings: EdgeSettings | None = None,
 ) -> BlurObservations:
-    """Measure a stream of (movie index, grey (h, w)), rising, of the frames of :func:`frames_to_read`.
+    """Measure a stream of (movie index, grey (h, w)), in ascending order, of the frames of :func:`frames_to_read`.
 
-    PAIR_FRAMES + 1 pictures are in memory at a time.  Profile and trajectory only pick the edges that hardly moved and
+    At most PAIR_FRAMES + 1 frames are in memory.  Profile and trajectory only select the edges with little motion and
     the frequencies that motion leaves above the noise.
     """
     curve = profile.response or ResponseCurve("srgb")
@@ -224,7 +225,7 @@ def observe_blur(
 def _measured(
     pictures: Stream, frames: Sequence[Frame], curve: ResponseCurve, settings: EdgeSettings, only_paired: frozenset[int]
 ) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps]]:
-    """Edges and steps of all pictures but some, and spectra of all pairs of them."""
+    """Edges, spectrum ratios and steps of all frames; frames in ``only_paired`` only serve as the first of a pair."""
     edges: list[EdgeWidths] = []
     steps: list[IsolatedSteps] = []
     pairs: list[SpectrumRatios] = []
@@ -244,7 +245,7 @@ def _measured(
 
 
 def _recent(frames: Sequence[Frame], index: int) -> tuple[Frame, ...]:
-    """A frame and the MEMORY − 1 before it, newest first; the next one stands for a frame at no known time."""
+    """A frame and the MEMORY − 1 before it, newest first; a frame without known times is replaced by the next one."""
     recent = [frames[index]]
     for k in range(index - 1, index - MEMORY, -1):
         known = k >= 0 and frames[k].exposure_s is not None and frames[k].skip_reason is None
@@ -264,16 +265,16 @@ def _chosen(
 
 @dataclass(frozen=True, slots=True)
 class PredictedBlur:
-    """What the paths of a profile make of the observations; defocus, lens and damping are no part of it."""
+    """Blur that the paths of a profile predict; defocus, lens and damping are not included."""
 
     motion_px: Array
     """(edges,) standard deviation of the path across each edge."""
     log_ratios: Array
-    """(valid bins, MEMORY) of the spectra, of the frames themselves and of those before them."""
+    """(valid bins, MEMORY) log ratios of the spectra, of the frames themselves and of those before them."""
 
 
 def predicted_blur(observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> PredictedBlur:
-    """Follow the paths of a profile."""
+    """Predict blur from the paths of a profile."""
     return PredictedBlur(
         _motion_px(observations.edges, profile, trajectory),
         predicted_ratios(observations.ratios, profile, trajectory)[observations.valid],
@@ -288,11 +289,11 @@ def residuals(
     damping: float = 1.0,
     predicted: PredictedBlur | None = None,
 ) -> Array:
-    """Measured less predicted blur, px (n,): widths of edges, then spectra as widths of the motion.
+    """Measured − predicted blur, px (n,): edge widths, then spectra converted to motion widths.
 
-    A log ratio changes by 2 (2π f)² τ δτ with the path's standard deviation τ; it is given as δτ at τ = 1 px.
-    The profile alone carries every effect; lens_sigma_px and damping are nuisances of the measurement.  predicted: what
-    its paths make, where that is known already.
+    A log ratio changes by 2 (2π f)² τ δτ with the path's standard deviation τ; it is converted to δτ at τ = 1 px.
+    All effects come from the profile; lens_sigma_px and damping are nuisances of the measurement.  predicted: the blur
+    of its paths, if already computed.
     """
     predicted = predicted or predicted_blur(observations, profile, trajectory)
     widths = fitted_width(predicted.motion_px, defocus_px(profile, observations.edges.points_px), lens_sigma_px)
@@ -311,7 +312,7 @@ def _ratio_residuals(observations: BlurObservations, log_ratios: Array, damping:
 
 
 def _remembered(off: Array, columns: Array) -> Array:
-    """What earlier frames' blur adds to the log ratios: robust least squares for the share of each."""
+    """Contribution of earlier frames' blur to the log ratios: robust least squares for the share of each."""
     weight = np.ones(len(off))
     fitted = np.zeros(len(off))
     for _ in range(4 if len(off) > 3 * columns.shape[1] else 0):
@@ -328,6 +329,6 @@ def _motion_px(edges: EdgeWidths, profile: CameraProfile, trajectory: Trajectory
 
 
 def time_blocks(time_s: Array, count: int = BLOCKS) -> NDArray[np.intp]:
-    """Block (n,) of each residual: equal numbers of distinct stamps in each."""
+    """Block (n,) of each residual; each block has the same number of distinct timestamps."""
     stamps = np.unique(time_s)
     return even_blocks(np.searchsorted(stamps, time_s), len(stamps), count)

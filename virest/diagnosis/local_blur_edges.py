@@ -10,8 +10,8 @@ to its profile.  It counts only if both plateaus reach ISOLATION widths from its
 profile: textures, thin lines and shading fail that test, whereas steps pass it however blurred they are.
 
 Few steps are isolated over a long reach, so taking for each edge the shortest reach that holds its own width would
-favour edges that seem narrow.  All edges of a capture are therefore measured over one reach, SPREAD times what their
-usual width asks for (:func:`evenly_isolated`).
+favour edges that seem narrow.  All edges of a capture are therefore measured over one reach, WIDTH_MARGIN times
+what their median width needs (:func:`evenly_isolated`).
 """
 
 from __future__ import annotations
@@ -32,32 +32,32 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 STEP_PX = 0.5
-"""Between two samples of a profile."""
+"""Sample spacing of a profile."""
 REACHES_PX = (4.0, 5.5, 7.5, 10.0, 14.0, 16.5, 19.0)
-"""Half lengths of the tried profiles, shortest first."""
+"""Half lengths of the profiles that are fitted, shortest first."""
 ISOLATION = 4.0
-"""Plateaus must reach this many widths, and a pixel, from the edge's middle."""
-SPREAD = 1.2
-"""Edges this many times as wide as usual are still measured over the reach that all edges of a capture share.  Widths
-in one capture scatter by 4 to 14 % (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
-OTHERS_WIDER = 2.0
-"""Other frames of a capture may be up to this many times as soft, so reaches are tried up to that width."""
+"""Plateaus must reach this many widths plus 1 px from the middle of the edge."""
+WIDTH_MARGIN = 1.2
+"""Edges up to this many times as wide as the median are measured over the reach that all edges of a capture share.
+Widths in one capture scatter by 4 to 14 % (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
+MAX_SOFTNESS_RATIO = 2.0
+"""Other frames of a capture may be up to this many times as soft, so reaches are fitted up to that width."""
 LEAST_WIDTH_PX = 0.05
 _FIT_STEPS, _FURTHER_STEPS = 12, 3
-"""Iterations of the descent from a guess, and from the fit over a shorter reach of the same step."""
+"""Iterations of the fit from a guess, and from the fit of the same step over a shorter reach."""
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeWidths:
     """Widths of edges with their positions, times and conditions.
 
-    Before :func:`isolated_edges` one row for each edge and reach that holds it, afterwards one row an isolated edge.
+    Before :func:`isolated_edges`, one row for each edge and reach that holds it; afterwards, one row per isolated edge.
     """
 
     frame: NDArray[np.intp]
     """(n,) movie index."""
     stamp_s: Array
-    """(n,) the frame's stamp, camera clock."""
+    """(n,) the frame's timestamp, camera clock."""
     exposure_s: Array
     """(n,) as logged."""
     points_px: Array
@@ -65,29 +65,29 @@ class EdgeWidths:
     normal: Array
     """(n, 2) unit normal, from dark to bright."""
     number: NDArray[np.intp]
-    """(n,) of the edge in its frame."""
+    """(n,) index of the edge in its frame."""
     reach_px: Array
     """(n,) half length of the profile."""
     width_px: Array
-    """(n,) standard deviation of the Gaussian that spreads the step; 0 where the profile is no step."""
+    """(n,) standard deviation of the Gaussian that blurs the step; 0 where the profile is not a step."""
     step_levels: Array
-    """(n,) height, grey levels."""
+    """(n,) step height, grey levels."""
     brightness: Array
     """(n,) mean grey of the profile, 0 to 1."""
     candidates: int = 0
-    """Slopes strong enough to be tried."""
+    """Number of gradients strong enough to be tested."""
 
     def __len__(self) -> int:
         return len(self.frame)
 
     def select(self, keep: NDArray[Any]) -> EdgeWidths:
-        """The rows of a mask or index."""
+        """The rows at a mask or index."""
         rows = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name != "candidates"}
         return replace(self, **rows)
 
 
 def join_edges(parts: Sequence[EdgeWidths]) -> EdgeWidths:
-    """Rows of several pictures, one after another."""
+    """Concatenate the rows of several frames."""
     if not parts:
         return _no_edges()
     names = [f.name for f in fields(EdgeWidths) if f.name != "candidates"]
@@ -102,7 +102,7 @@ def observe_picture(
     settings: EdgeSettings,
     found: tuple[Array, Array] | None = None,
 ) -> EdgeWidths:
-    """Widths of the isolated edges of one picture; found: its edges, where :func:`find_edges` has given them."""
+    """Widths of the edges in one frame, over every reach; found: the result of :func:`find_edges`, if available."""
     points, normals = find_edges(picture, settings) if found is None else found
     grey = _profiles(picture.astype(np.float32), points, normals)
     light = _profiles(curve.linear_table()[picture], points, normals)
@@ -126,8 +126,8 @@ def observe_picture(
 
 
 def shared_reach_px(width_px: Array) -> float:
-    """The one reach over which edges of these widths (n,) are all measured."""
-    return ISOLATION * SPREAD * float(np.median(width_px)) + 1.0 if len(width_px) else 0.0
+    """The common reach over which edges of these widths (n,) are measured."""
+    return ISOLATION * WIDTH_MARGIN * float(np.median(width_px)) + 1.0 if len(width_px) else 0.0
 
 
 def share_a_reach(edges: EdgeWidths) -> bool:
@@ -136,7 +136,7 @@ def share_a_reach(edges: EdgeWidths) -> bool:
 
 
 def isolated_edges(seen: EdgeWidths, least_reach_px: float = 0.0) -> EdgeWidths:
-    """Each edge over its shortest reach not below the least, if its profile there is a step."""
+    """Each edge over its shortest reach of at least least_reach_px, if its profile there is a step."""
     far = seen.select(seen.reach_px >= least_reach_px)
     order = np.lexsort((far.reach_px, far.number, far.frame))
     edge = np.stack([far.frame, far.number], axis=-1)[order]
@@ -145,10 +145,10 @@ def isolated_edges(seen: EdgeWidths, least_reach_px: float = 0.0) -> EdgeWidths:
 
 
 def evenly_isolated(seen: EdgeWidths, least: int) -> EdgeWidths:
-    """The isolated edges over one common reach, SPREAD times what the usual width asks for; wider ones over their own.
+    """The isolated edges over one common reach, WIDTH_MARGIN times what the median width needs; wider ones over theirs.
 
-    Whether an edge of about the usual width counts then depends on its surroundings, not on its own width.  Where
-    fewer than the least number are isolated over that reach, each has its own.
+    Whether an edge of about the median width counts then depends on its surroundings, not on its own width.  If fewer
+    than ``least`` edges are isolated over that reach, each is measured over its own.
     """
     found, reach_px = isolated_edges(seen), 0.0
     while len(found) >= max(least, 1):
@@ -162,7 +162,7 @@ def evenly_isolated(seen: EdgeWidths, least: int) -> EdgeWidths:
 
 
 def _profiles(plane: Any, points: Array, normals: Array) -> Array:
-    """Mean of parallel profiles across each edge, (n, 2 reach / STEP_PX + 1), dark to bright; NaN outside."""
+    """Mean of parallel profiles across each edge, (n, 2 reach / STEP_PX + 1), dark to bright; NaN outside the frame."""
     along = np.arange(-REACHES_PX[-1], REACHES_PX[-1] + 1e-9, STEP_PX)
     tangents = np.stack([-normals[:, 1], normals[:, 0]], -1)
     total = np.zeros((len(points), len(along)))
@@ -173,7 +173,7 @@ def _profiles(plane: Any, points: Array, normals: Array) -> Array:
 
 
 def _levels_of(grey: Array, reach_px: Array) -> tuple[Array, Array, Array]:
-    """Step between the profile's ends, its brightest sample, and its mean, over each edge's own reach."""
+    """(step between the profile's ends, brightest sample, mean) over each edge's own reach."""
     middle = grey.shape[1] // 2
     away = np.abs(np.arange(grey.shape[1]) - middle) * STEP_PX
     inside = np.where(away <= reach_px[:, None], grey, np.nan)
@@ -190,19 +190,19 @@ def _levels_of(grey: Array, reach_px: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class WidthFit:
-    """Steps fitted to profiles over every reach that holds them; width 0: not a step."""
+    """Steps fitted to profiles over every reach that holds them; width 0: the profile is not a step."""
 
     row: NDArray[np.intp]
-    """(n,) which profile."""
+    """(n,) index of the profile."""
     width_px: Array
     centre_px: Array
     reach_px: Array
 
 
 def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
-    """Fit profiles (n, m) of a picture over all reaches that may be shared, and keep those that hold ISOLATION widths.
+    """Fit profiles (n, m) of a frame over all reaches that may be shared; keep those that hold ISOLATION widths.
 
-    The reaches follow from the profiles alone, never from a predicted blur: no model chooses its own evidence.
+    The reaches follow from the profiles alone, not from a predicted blur, so no model chooses its own evidence.
     """
     count, middle = len(profiles), profiles.shape[1] // 2
     centre, width, ended = np.zeros(count), np.zeros(count), np.zeros(count, bool)
@@ -212,7 +212,7 @@ def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
         part = profiles[:, middle - half : middle + half + 1]
         whole = np.isfinite(part).all(axis=1) & (np.ptp(np.nan_to_num(part), axis=1) > 0)
         misfit = np.full(count, np.inf)
-        further = ended & (reach <= OTHERS_WIDER * shared_reach_px(width[ended]))
+        further = ended & (reach <= MAX_SOFTNESS_RATIO * shared_reach_px(width[ended]))
         for rows, steps in ((whole & ~ended, _FIT_STEPS), (whole & further, _FURTHER_STEPS)):
             width[rows & ~ended] = 0.25 * reach
             centre[rows & ~ended] = 0.0
@@ -234,8 +234,8 @@ def fit_steps(
 ) -> tuple[Array, Array, Array]:
     """Least squares of a + b erf((u − u0)/√2 s) to profiles (n, m) over ± reach: u0, s, misfit.
 
-    a and b follow linearly from u0 and s; these by damped Gauss-Newton steps.  misfit: rms as part of the step 2 b.
-    start: u0 and s (n,) to begin from; None: a step in the middle, a quarter of the reach wide.
+    a and b follow linearly from u0 and s; these by damped Gauss-Newton steps.  misfit: rms as a fraction of the step
+    2 b.  start: u0 and s (n,); None: a step in the middle, a quarter of the reach wide.
     """
     u = np.linspace(-reach_px, reach_px, profiles.shape[1])
     centre, width = start or (np.zeros(len(profiles)), np.full(len(profiles), 0.25 * reach_px))
@@ -254,7 +254,7 @@ def fit_steps(
 
 
 def _step_model(u: Array, profiles: Array, centre: Array, width: Array) -> tuple[Array, Array, Array]:
-    """Best b, derivatives (n, 4, m) by a, b, u0 and s, and what is left of the profiles."""
+    """(best b, derivatives (n, 4, m) with respect to a, b, u0 and s, residuals of the profiles)."""
     z = (u - centre[:, None]) / width[:, None]
     shape = erf(z / np.sqrt(2.0))
     mean_shape, mean_profile = shape.mean(axis=1, keepdims=True), profiles.mean(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Fit exposure time and defocus to the local blur, with deviations that hold, and judge them on other time blocks."""
+"""Fit exposure time and defocus to the local blur, with clustered covariances, and judge them on other time blocks."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ Mask = NDArray[np.bool_]
 
 _EXPOSURE_SCALES = (0.05, 20.0)
 SHIFT_STD_S = 0.004
-"""Standard deviation of the rows' times after the geometric fit; their shift is a nuisance parameter of every fit."""
+"""Standard deviation of the row times after the geometric fit; their shift is a nuisance parameter of every fit."""
 PATH_STD = 0.03
-"""Relative error of the predicted path's length that focal length and gyroscope scale leave."""
+"""Relative error of the predicted path length, from focal length and gyroscope scale."""
 EDGE_STD = 0.04
-"""Relative error that all edge widths of a capture share, from soft edges of the scene and detail lost to the encoder:
+"""Relative error common to all edge widths of a capture, from soft edges in the scene and detail lost to the encoder;
 ``python -m virest.app.bench --only edges`` prints it for a defocus of 2 to 3.5 px."""
 OWN_REACH_STD = 0.06
-"""The same where too few edges are isolated over one reach, so that each is measured over its own: −0.048 in the mean
-over 12 simulated captures, standard deviation 0.036."""
+"""The same where too few edges are isolated over one reach and each is measured over its own: mean −0.048, standard
+deviation 0.036 over 12 simulated captures."""
 _NUISANCE = np.array([LENS_SIGMA_PX, 0.0])
 _NUISANCE_STD = np.array([LENS_STD_PX, SHIFT_STD_S])
 _NUISANCE_LOW = np.array([0.35, -0.03])
 _NUISANCE_HIGH = np.array([0.95, 0.03])
 _LOW, _HIGH, _STEP = 0.02, 50.0, 0.02
-"""Bounds of every effect's value, and its finite difference."""
+"""Bounds of every effect's value, and its finite-difference step."""
 _NUISANCE_STEP = np.array([0.02, 5e-4])
 _DAMPING_STEP, _LEAST_STD_PX = 0.02, 1e-3
 
@@ -61,7 +61,7 @@ class BlurEffect(Protocol):
     parameters: tuple[str, ...]
 
     def starts(self, observations: BlurObservations, profile: CameraProfile) -> list[Array]:
-        """Values from which to fit."""
+        """Starting values of a fit."""
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """The profile with the effect's parameters set."""
@@ -81,7 +81,7 @@ class ExposureTime:
     parameters: tuple[str, ...] = ("exposure_scale",)
 
     def starts(self, observations: BlurObservations, profile: CameraProfile) -> list[Array]:
-        """What the profile has."""
+        """The profile's value."""
         return [np.array([profile.shutter.exposure_scale])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
@@ -90,7 +90,7 @@ class ExposureTime:
         return replace(profile, shutter=replace(profile.shutter, exposure_scale=scale))
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
-        """Enough tiles, in frames that moved unequally."""
+        """Whether there are enough tiles in frames with unequal motion."""
         valid = observations.valid
         if valid.sum() < MIN_RATIOS:
             return False
@@ -98,20 +98,20 @@ class ExposureTime:
         return float(np.sqrt(np.mean(own**2))) > MIN_CONTRAST
 
     def possible(self, values: Array) -> bool:
-        """Blur paths of zero or unlimited length explain nothing: something else is wrong."""
+        """Whether the scale is within its bounds; at a bound, something else is wrong."""
         low, high = _EXPOSURE_SCALES
         return low < float(values[0]) < high
 
 
 @dataclass(frozen=True, slots=True)
 class Defocus:
-    """A Gaussian on the light beyond the lens: no edge is sharper than it."""
+    """A Gaussian blur of the light in addition to the lens's; no edge is sharper than it."""
 
     name: str = "defocus"
     parameters: tuple[str, ...] = ("sigma_px",)
 
     def starts(self, observations: BlurObservations, profile: CameraProfile) -> list[Array]:
-        """Excess width of the sharper half of the edges over the lens's."""
+        """Excess of the edges' 0.4 quantile of width over the lens's width."""
         width = float(np.quantile(observations.edges.width_px, 0.4)) if len(observations.edges) else LENS_SIGMA_PX
         return [np.array([np.sqrt(max(width**2 - LENS_SIGMA_PX**2, 0.04))])]
 
@@ -121,7 +121,7 @@ class Defocus:
         return replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=sigma))
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
-        """Enough isolated steps."""
+        """Whether there are enough isolated steps."""
         return observations.edges_determined
 
     def possible(self, values: Array) -> bool:
@@ -131,19 +131,19 @@ class Defocus:
 
 @dataclass(frozen=True, slots=True)
 class BlurFit:
-    """Values of some effects, with the measurement's nuisances fitted beside them."""
+    """Values of some effects, fitted together with the nuisances of the measurement."""
 
     effects: tuple[str, ...]
     values: tuple[Array, ...]
-    """One array an effect."""
+    """One array per effect."""
     covariance: Array
-    """Of all values, one effect after another; infinite where the capture does not determine the effect."""
+    """Covariance of all values, in order of effects; infinite where the capture does not determine the effect."""
     nuisance: Array
     """Width of a sharp edge (px), shift of the rows' times (s)."""
     profile: CameraProfile
-    """With the effects applied; the nuisances are no part of it."""
+    """With the effects applied, without the nuisances."""
     rms_px: float
-    """Robust rms of the residuals used."""
+    """Robust rms of the residuals that were fitted."""
     determined: tuple[bool, ...]
 
     @property
@@ -159,11 +159,11 @@ def fit(
     effects: Sequence[BlurEffect],
     use: Mask | None = None,
 ) -> BlurFit:
-    """Fit the effects' values and the nuisances, which have priors, robustly.
+    """Robust fit of the effects' values, together with the nuisances, which have priors.
 
-    use: mask over the residuals.  Effects that the capture does not determine, or whose values reach a bound, keep
-    their values, with infinite deviations.  The covariance is a sandwich over time blocks, within which errors are
-    correlated.
+    use: mask of the residuals.  Effects that the capture does not determine, or whose values reach a bound, are not
+    fitted: their values are NaN with infinite variance, and the profile keeps its own.  The covariance is a sandwich
+    over time blocks, within which errors are correlated.
     """
     use = np.ones(len(observations), bool) if use is None else use
     known = tuple(e.determined(observations, profile, trajectory) for e in effects)
@@ -180,7 +180,7 @@ def _fit(
     use: Mask,
     known: tuple[bool, ...],
 ) -> BlurFit:
-    """As :func:`fit`, for effects that are known to be determined."""
+    """As :func:`fit`; ``known``: which of the effects are determined and thus fitted."""
     free = [e for e, yes in zip(effects, known, strict=True) if yes]
     evidence = _Widths(observations, profile, trajectory, free, use)
     found = descend(evidence, np.concatenate([*(e.starts(observations, profile)[0] for e in free), _NUISANCE]))
@@ -188,7 +188,7 @@ def _fit(
 
 
 def judge(observations: BlurObservations, found: BlurFit, trajectory: Trajectory, use: Mask) -> float:
-    """Robust rms, px, of the residuals of a mask under a fit made on others."""
+    """Robust rms, px, of the residuals at a mask under a fit."""
     lens, shift = found.nuisance
     moved = _shifted(found.profile, float(shift))
     return robust_std(residuals(observations, moved, trajectory, float(lens))[use])
@@ -197,7 +197,7 @@ def judge(observations: BlurObservations, found: BlurFit, trajectory: Trajectory
 def held_out(
     observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory, effects: Sequence[BlurEffect]
 ) -> HeldOutGain:
-    """Robust rms, px, without and with the effects, fitted on every other time block and judged on the rest."""
+    """Robust rms, px, without and with the effects, fitted to every other time block and judged on the rest."""
     even, odd = halves(time_blocks(observations.time_s))
     before, after = (fit(observations, profile, trajectory, chosen, even) for chosen in ((), effects))
     before_px, after_px = (judge(observations, one, trajectory, odd) for one in (before, after))
@@ -206,7 +206,7 @@ def held_out(
 
 @dataclass(frozen=True, slots=True)
 class _Widths:
-    """Widths and spectra as evidence: values of the effects, then the nuisances."""
+    """Edge widths and spectra as evidence; parameters: the effects' values, then the nuisances."""
 
     observations: BlurObservations
     profile: CameraProfile
@@ -214,11 +214,11 @@ class _Widths:
     effects: Sequence[BlurEffect]
     use: Mask
     known: dict[tuple[float, float], PredictedBlur] = field(default_factory=dict)
-    """What paths were seen to make, by exposure scale and shift: nothing else in a fit changes them."""
+    """Predicted blur by exposure scale and shift, the only parameters of a fit that change the paths."""
 
     @property
     def count(self) -> int:
-        """Values of the effects."""
+        """Number of the effects' values."""
         return sum(len(e.parameters) for e in self.effects)
 
     def applied(self, values: Array) -> CameraProfile:
@@ -246,7 +246,7 @@ class _Widths:
         return Residuals(left, slopes_by_steps(lambda at: -self.left(at), -left, values, steps, high), left)
 
     def weighed(self, values: Array, look: Residuals) -> System[Array, Residuals]:
-        """Edges and spectra each have their own deviation, which their residuals tell."""
+        """Edges and spectra each have their own scale, estimated from their residuals."""
         scale, edge = np.empty(len(look.left)), self.observations.is_edge[self.use]
         for kind in (edge, ~edge):
             scale[kind] = max(robust_std(look.left[kind]), _LEAST_STD_PX)
@@ -264,10 +264,10 @@ class _Widths:
         return np.append(np.full(self.count, of_effects), of_nuisances)
 
     def covariance(self, found: System[Array, Residuals]) -> Array:
-        """H⁻¹ (Σ g g' over time blocks + prior) H⁻¹ of all values, and what unknown damping and widths add.
+        """H⁻¹ (Σ g g' over time blocks + prior) H⁻¹ of all values, plus the effect of unknown damping and width errors.
 
-        The damping is not fitted: beside the path length only the ratios' curvature determines it, which coding changes
-        too.  Nor is an error common to all widths, which acts like a defocus.
+        The damping is not fitted: apart from the path length, only the curvature of the ratios determines it, and
+        coding changes that too.  Nor is an error common to all widths, which acts like a defocus.
         """
         observations, edge = self.observations, self.observations.is_edge
         block = time_blocks(observations.time_s)[self.use]
@@ -284,7 +284,7 @@ class _Widths:
 def _as_fit(
     evidence: _Widths, effects: Sequence[BlurEffect], known: tuple[bool, ...], found: System[Array, Residuals]
 ) -> BlurFit:
-    """Spread the free effects' values among all that were asked for."""
+    """Arrange the fitted effects' values among those of all requested effects."""
     sizes, count = [len(e.parameters) for e in effects], evidence.count
     place = np.flatnonzero(np.repeat(known, sizes))
     values, spread = np.full(sum(sizes), np.nan), np.diag(np.full(sum(sizes), np.inf))

@@ -1,7 +1,7 @@
 """Local blur as the profile predicts it: blur paths of the forward model, across edges and in spectra.
 
-A fit needs the paths of some hundred frames many times, so they are computed for all frames together, from the
-trajectory and the moving lens that `image_formation.kernels` also uses; a test compares the two.
+A fit needs the paths of about 100 frames many times, so they are computed for all frames together, from the trajectory
+and the moving lens that `image_formation.kernels` also uses; a test compares the two.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from virest.motion.trajectory import Trajectory
 Array = NDArray[np.float64]
 _NODES = 4
 _INSTANTS = 5
-"""Gauss-Legendre nodes of an exposure: exact for paths that are polynomials of fourth order in time."""
+"""Gauss-Legendre nodes of an exposure: exact for paths that are fourth-order polynomials in time."""
 _RATIOS = np.linspace(0.0, 6.0, 25)
 LEAST_ANGLE = 1e-3
 """Below it sin q / q is 1 to single precision."""
 
 
 def fitted_width(motion_px: Array, defocus_px: Array | float, lens_px: float) -> Array:
-    """Width that the fit of an edge reports for the convolution of a straight path and a Gaussian.
+    """Width that the edge fit reports for the convolution of a straight path and a Gaussian.
 
     motion_px: standard deviation of the path across the edge.  A path alone is a ramp, not a Gaussian, so the fitted
-    width is not quite the root of the summed variances; the ratio of the two is tabled by fitting such profiles.
+    width is not exactly the root of the summed variances; the ratio of the two is tabulated by fitting such profiles.
     """
     still = np.hypot(defocus_px, lens_px)
     return np.hypot(motion_px, still) * np.interp(motion_px / still, _RATIOS, _shape_table())
@@ -43,7 +43,7 @@ def fitted_width(motion_px: Array, defocus_px: Array | float, lens_px: float) ->
 
 @lru_cache(maxsize=1)
 def _shape_table() -> Array:
-    """Fitted width over root of summed variances, for paths of _RATIOS times the Gaussian's width."""
+    """Fitted width over the root of the summed variances, for paths of _RATIOS times the Gaussian's width."""
     total, reach = 2.0, 9.0
     u = np.linspace(-reach, reach, round(2 * reach / STEP_PX) + 1)
     still = (total / np.hypot(1.0, _RATIOS))[:, None, None]
@@ -57,14 +57,14 @@ def path_tensors(
 ) -> Array:
     """Covariance xx, xy, yy, px², (n, 3), of the blur path at points (n, 2) of frames with stamps and exposures (n,).
 
-    Paths are computed on a few nodes over each frame; their covariance is a smooth function of the place.
+    Paths are computed at a few nodes over each frame; their covariance is a smooth function of image position.
     """
     nodes, inverse = _nodes(profile.width, profile.height)
     frames, number = np.unique(np.stack([stamp_s, exposure_s], axis=-1), axis=0, return_inverse=True)
     spread = node_tensors(nodes, frames[:, 0], frames[:, 1], profile, trajectory)
     coefficients = np.einsum("ij,fjk->fik", inverse, spread)
-    places = _monomials(points_px, profile.width, profile.height)
-    return np.asarray(np.einsum("ni,nik->nk", places, coefficients[number.ravel()]))
+    basis = _monomials(points_px, profile.width, profile.height)
+    return np.asarray(np.einsum("ni,nik->nk", basis, coefficients[number.ravel()]))
 
 
 def node_tensors(
@@ -89,10 +89,10 @@ def across(tensors: Array, direction: Array) -> Array:
 
 
 def transfers(ratios: SpectrumRatios, profile: CameraProfile, trajectory: Trajectory) -> Array:
-    """|K|² of each tile's two frames and of those before them, as the bins see it: (n, 2, MEMORY, b).
+    """|K|² of each tile's two frames and of those before them, averaged over each bin: (n, 2, MEMORY, b).
 
-    A straight path's |K|² = (sin q / q)² with q² = 3 (2π)² f' Σ f.  In single precision: right to 1e-6, of what is
-    measured to some 1e-2.
+    A straight path has |K|² = (sin q / q)² with q² = 3 (2π)² f' Σ f.  Single precision is accurate to 1e-6, the
+    measurement to about 1e-2.
     """
     points = np.broadcast_to(ratios.points_px[:, :, None], (len(ratios), 2, MEMORY, 2))
     tensors = path_tensors(

@@ -2,7 +2,7 @@
 
 In linear light a tile's power is |K|² |lens|² |scene|² plus a noise floor.  In the ratio of two frames that show the
 same patch the scene, the lens and defocus cancel: log P1/P2 = log |K1|²/|K2|².  The ratio depends on motion alone; it
-needs neither edges nor a prior for the scene, only frames with unequal motion.
+needs neither edges nor a prior of the scene, only frames with unequal motion.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ MEMORY = 3
 """Number of frames whose blur a decoded frame may show: its own and, through H.264's prediction, those before it."""
 SPACING_PX = 48
 BANDS_PER_PX = (0.055, 0.08, 0.11)
-"""Edges of the rings of frequency, cycles a pixel: above the window's own width, below what H.264 quantises away."""
+"""Bounds of the frequency rings, cycles per pixel: above the window's own width, below what H.264 quantises away."""
 SECTORS = 6
 SCENE_POWER = 2.5
-"""A scene's power falls with about this power of the frequency: 2 for natural texture, 3 for edges."""
+"""Exponent with which a scene's power falls with frequency: 2 for natural texture, 3 for edges."""
 MAX_BACK_PX = 0.3
-"""A tile whose tracked middle does not come back to within this is dropped."""
+"""Drop a tile whose centre, tracked forth and back, returns with a larger error than this."""
 MIN_FLOOR_LEVELS = 2.0
-"""Least error of a decoded frame, grey levels: quantisation adds more than smooth regions show."""
+"""Minimum noise of a decoded frame, grey levels: quantisation adds more than smooth regions show."""
 SIGNAL_TO_FLOOR = 8.0
-"""Least power of a ring's sector over the floor, in the mean of both frames."""
+"""Minimum ratio of a bin's power, averaged over both frames, to the noise floor."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpectrumRatios:
-    """One row a tile seen in two frames; (…, 2) holds the first and the second frame."""
+    """One row per tile seen in two frames; (…, 2) holds the first and the second frame."""
 
     frame: NDArray[np.intp]
     """(n, 2) movie indices."""
@@ -50,9 +50,9 @@ class SpectrumRatios:
     exposure_s: Array
     """(n, 2, MEMORY) as logged, of the same frames."""
     points_px: Array
-    """(n, 2, 2) middle of the tile."""
+    """(n, 2, 2) centre of the tile."""
     log_ratio: Array
-    """(n, b) log of first over second power, in each ring and sector of :func:`bins`; NaN where noise drowns it."""
+    """(n, b) log of first over second power, in each ring and sector of :func:`bins`; NaN where noise dominates."""
     brightness: Array
     """(n,) mean grey, 0 to 1."""
 
@@ -60,13 +60,13 @@ class SpectrumRatios:
         return len(self.frame)
 
     def select(self, keep: NDArray[np.bool_]) -> SpectrumRatios:
-        """The rows of a mask."""
+        """The rows at a mask."""
         return SpectrumRatios(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 @lru_cache(maxsize=1)
 def bins() -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
-    """Frequencies (m, 2) in cycles a pixel inside the rings, their places in the flat spectrum, and bins (m,)."""
+    """(frequencies (m, 2) inside the rings, cycles per pixel; their indices in the flat spectrum; bins (m,))."""
     fx, fy = np.meshgrid(np.fft.rfftfreq(SIDE_PX), np.fft.fftfreq(SIDE_PX))
     radius = np.hypot(fx, fy)
     half_plane = (fx > 0) | (fy > 0)
@@ -79,7 +79,7 @@ def bins() -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
 
 
 def bin_count() -> int:
-    """Rings times sectors."""
+    """Number of bins: rings × sectors."""
     return (len(BANDS_PER_PX) - 1) * SECTORS
 
 
@@ -92,10 +92,10 @@ def mean_in_bins(values: Array) -> Array:
 
 @lru_cache(maxsize=1)
 def spectral_weights() -> tuple[Array, Array]:
-    """Frequencies (k, 2), and the weight (k, b) that the transfer |K|² at each has in the power of each bin.
+    """(frequencies (k, 2), weight (k, b) of the transfer |K|² at each in the power of each bin).
 
-    A Hann window mixes neighbouring frequencies by 1/6, 2/3, 1/6 each way, and a scene is stronger at the lower ones
-    (power f^-SCENE_POWER), so a bin shows less of the blur than its own frequencies suffer.
+    A Hann window mixes neighbouring frequencies by 1/6, 2/3, 1/6 along each axis, and a scene is stronger at the lower
+    ones (power f^-SCENE_POWER), so a bin shows less blur than its own frequencies undergo.
     """
     frequency, _, which = bins()
     steps = np.rint(frequency * SIDE_PX).astype(np.intp)
@@ -117,17 +117,17 @@ def ring_of_bin() -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class SeenFrame:
-    """A picture with the metadata of its frame and of the MEMORY − 1 frames before it."""
+    """The picture of a frame, with the metadata of the frame and of the MEMORY − 1 before it."""
 
     picture: Picture
     recent: tuple[Frame, ...]
-    """Newest first; the first frame of the movie stands for those before it."""
+    """Newest first; a frame without known times, or before the movie, is replaced by the next one."""
 
 
 def observe_pair(first: SeenFrame, second: SeenFrame, curve: ResponseCurve) -> SpectrumRatios:
-    """Ratios of the tiles that can be followed from one frame to the other."""
+    """Spectrum ratios of the tiles that can be tracked from one frame to the other."""
     picture_1, picture_2 = first.picture, second.picture
-    start, moved = _followed_tiles(picture_1, picture_2)
+    start, moved = _tracked_tiles(picture_1, picture_2)
     table, slope = curve.linear_table(), curve.slope_table()
     clipped = curve.clipped_table(1.5)
     power_1, grey_1, bad_1 = _tile_powers(picture_1, start, table, clipped)
@@ -151,7 +151,7 @@ def observe_pair(first: SeenFrame, second: SeenFrame, curve: ResponseCurve) -> S
 
 
 def join_ratios(parts: Iterable[SpectrumRatios]) -> SpectrumRatios:
-    """Rows of several pairs, one after another."""
+    """Concatenate the rows of several pairs."""
     parts = list(parts)
     if not parts:
         none = np.zeros((0, 2), np.intp)
@@ -160,8 +160,8 @@ def join_ratios(parts: Iterable[SpectrumRatios]) -> SpectrumRatios:
     return SpectrumRatios(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SpectrumRatios)))
 
 
-def _followed_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
-    """Whole-pixel middles (n, 2) of tiles in both pictures, tracked there and back."""
+def _tracked_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
+    """Whole-pixel centres (n, 2) of tiles in both frames, tracked forth and back."""
     height, width = first.shape
     reach = SIDE_PX // 2
     x, y = np.meshgrid(
@@ -183,7 +183,7 @@ def _followed_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
 def _tile_powers(
     picture: Picture, middles: Array, table: NDArray[np.float32], clipped: NDArray[np.bool_]
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Power (n, b) in linear light, mean grey (n,), and which tiles hold clipped light."""
+    """(power (n, b) in linear light, mean grey (n,), mask of the tiles with clipped light)."""
     reach = SIDE_PX // 2
     cuts = [picture[int(y) - reach : int(y) + reach, int(x) - reach : int(x) + reach] for x, y in middles]
     tiles = np.stack(cuts) if cuts else np.zeros((0, SIDE_PX, SIDE_PX), np.uint8)

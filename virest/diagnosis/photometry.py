@@ -3,10 +3,10 @@
 Model of one observation of a patch with unknown light L, in grey levels of 255:
 ``grey = E(L · product · vignetting(r) · flicker(t) · gain)``, E the profile's curve with its gamma and black level,
 ``product`` the logged exposure × ISO.  L is a nuisance: each evaluation profiles it out, patch by patch, in grey
-levels, where the noise is even.  In light, a steeper curve would shrink the residuals and so explain anything.
+levels, where the noise is uniform.  In linear light, a steeper curve would shrink the residuals and explain anything.
 
-A video encoder at a low bit rate delays small changes of brightness: in a flat moving patch it repeats its last picture
-and corrects a part of the difference.  Decoded grey: ``y[k] = x[k] + memory (y[k−1] − x[k])``, y = x in intra-coded
+A video encoder at a low bit rate delays small changes of brightness: in a flat moving patch it repeats its last frame
+and corrects part of the difference.  Decoded grey: ``y[k] = x[k] + memory (y[k−1] − x[k])``, y = x in intra-coded
 frames.  At 0.25 bits a pixel memory is about 0.25, and flicker of 100 Hz at 30 frames a second appears a third weaker
 and 0.2 rad late.  The memory is a property of the movie; fits estimate it with the other values.
 """
@@ -31,7 +31,7 @@ Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 _LOG_LIGHT = np.arange(-9.5, 0.75, 0.002)
-"""Grid of the tabulated curve, natural logarithm of the light."""
+"""Grid of the tabulated curve, natural logarithm of light."""
 _LIGHT_STEPS = 3
 _LEAST_SLOPE = 0.02
 """Grey levels per unit of log light below which an observation does not determine its light."""
@@ -42,17 +42,17 @@ class PhotometricObservations:
     """Mean grey of patches, one entry for each patch, channel and frame that shows it; all arrays (n,)."""
 
     patch: Indices
-    """Patch and channel: 3 · place + channel. Entries with the same number share one unknown light."""
+    """Patch and channel: 3 · place + channel.  Entries with the same number share one unknown light."""
     frame: Indices
     """Movie index."""
     stamp_s: Array
-    """The frame's stamp, camera clock from stamp_0."""
+    """The frame's timestamp, camera clock from stamp_0."""
     row_fraction: Array
-    """Fraction s of the readout at the patch's middle, by the profile that the patches were looked up with."""
+    """Fraction s of the readout at the patch's centre, under the profile used to find the patches."""
     x_px: Array
     y_px: Array
     radius: Array
-    """Distance from the picture's centre, 1 at the corners."""
+    """Distance from the frame centre, 1 at the corners."""
     grey: Array
     """Mean of the patch, grey levels of 255."""
     noise: Array
@@ -60,47 +60,47 @@ class PhotometricObservations:
     exposure_s: Array
     """As logged; 0 where unknown."""
     log_product: Array
-    """Logarithm of logged exposure × ISO against the median frame; 0 where ISO or exposure are not logged."""
+    """Logarithm of logged exposure × ISO relative to the median frame; 0 where ISO or exposure are not logged."""
     log_product_std: Array
-    """What the rounding of the logged ISO leaves open."""
+    """Its standard deviation due to rounding of the logged ISO."""
     intra: Mask
-    """Whether the frame is coded on its own, without memory of earlier ones."""
+    """Whether the frame is intra-coded, without memory of earlier ones."""
     product_known: bool
     """Whether exposure and ISO are logged for every frame; without them no gain can be called unexplained."""
     width: int
     height: int
     memory: float = 0.0
-    """Part of the last decoded brightness that the encoder keeps; a nuisance, fitted with the effects."""
+    """Fraction of the last decoded brightness that the encoder keeps; a nuisance, fitted with the effects."""
 
     def __len__(self) -> int:
         return len(self.grey)
 
     @property
     def place(self) -> Indices:
-        """(n,) the patch without its channel."""
+        """(n,) number of the patch without its channel."""
         return self.patch // 3
 
     @property
     def frames(self) -> Indices:
-        """(k,) movie indices that occur, rising."""
+        """(k,) movie indices that occur, ascending."""
         return np.unique(self.frame)
 
     def row_time_s(self, profile: CameraProfile, exposure_share: float = ROW_START) -> Array:
-        """When each observation's row is exposed to a share of its exposure, IMU clock from stamp_0, (n,)."""
+        """(n,) time at which each observation's row reaches a fraction of its exposure, IMU clock from stamp_0."""
         return np.asarray(RowClock(profile).time_s(self.stamp_s, self.exposure_s, self.row_fraction, exposure_share))
 
     def subset(self, use: Mask) -> PhotometricObservations:
-        """Only the chosen observations."""
+        """The observations at a mask."""
         fields = {name: getattr(self, name) for name in self.__slots__}
         chosen: dict[str, Any] = {name: v[use] for name, v in fields.items() if isinstance(v, np.ndarray)}
         return replace(self, **chosen)
 
     def with_memory(self, memory: float) -> PhotometricObservations:
-        """The same with another memory of the encoder."""
+        """The same with another encoder memory."""
         return replace(self, memory=memory)
 
     def covariates(self, profile: CameraProfile) -> dict[str, Array]:
-        """What residuals may have structure along."""
+        """Covariates of the residuals."""
         return {
             "row": self.row_fraction,
             "time": self.row_time_s(profile),
@@ -112,18 +112,18 @@ class PhotometricObservations:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """A profile's prediction of the observations, the patches' light profiled out."""
+    """A profile's prediction of the observations, with the patches' light profiled out."""
 
     residual: Array
     """(n,) measured − predicted, grey levels of 255."""
     slope: Array
-    """(n,) change of the predicted grey with log light, grey levels."""
+    """(n,) derivative of the predicted grey with respect to log light, grey levels."""
     share: Array
-    """(n,) part of the observation in its patch's light; sums to 1 over a patch."""
+    """(n,) weight of the observation in its patch's light; sums to 1 over a patch."""
     observations: PhotometricObservations
 
     def respond(self, columns: Array) -> Array:
-        """Change of the residuals (n, k) where log light factors change by ``columns`` (n, k), L following."""
+        """Change of the residuals (n, k) when log light factors change by ``columns`` (n, k) and L is refitted."""
         change = remembered(self.observations, self.slope[:, None] * columns)
         patch, slope = self.observations.patch, self.slope[:, None]
         mean = np.stack([np.bincount(patch, self.share * c) for c in (change / slope).T], axis=-1)
@@ -131,7 +131,7 @@ class Prediction:
 
 
 def log_light_factor(observations: PhotometricObservations, profile: CameraProfile) -> Array:
-    """Logarithm of all that multiplies a patch's light, (n,): product, vignetting, flicker, gain."""
+    """(n,) logarithm of all factors on a patch's light: product, vignetting, brightness fields, flicker, gain."""
     ext = profile.extensions
     total = observations.log_product.copy()
     if ext.vignetting_corner_loss:
@@ -151,7 +151,7 @@ def log_light_factor(observations: PhotometricObservations, profile: CameraProfi
 def predict(observations: PhotometricObservations, profile: CameraProfile, weight: Array | None = None) -> Prediction:
     """Fit each patch's light to its observations under the profile, and predict their grey.
 
-    weight: (n,) of the observations in that fit; 1 / noise² unless given.
+    weight: (n,) weights in that fit; 1 / noise² unless given.
     """
     weight = 1.0 / observations.noise**2 if weight is None else weight
     tables = _tables(profile.response or ResponseCurve("srgb"))
@@ -171,7 +171,7 @@ def predict(observations: PhotometricObservations, profile: CameraProfile, weigh
 
 
 def remembered(observations: PhotometricObservations, grey: Array) -> Array:
-    """Decoded brightnesses for true ones (n,) or (n, k): each patch follows with the encoder's memory.
+    """Decoded brightness for true brightness (n,) or (n, k): each patch lags with the encoder's memory.
 
     Linear in ``grey``.  The memory of a patch fades over frames that do not show it; its first observation is exact.
     """
@@ -179,7 +179,7 @@ def remembered(observations: PhotometricObservations, grey: Array) -> Array:
 
 
 def _kept(observations: PhotometricObservations) -> list[Array]:
-    """Part of a lag left after 1, 2, 4 … observations of its patch, (n,) each; empty without memory."""
+    """Fraction of a lag left after 1, 2, 4 … observations of its patch, (n,) each; empty without memory."""
     memory, patch, frame = observations.memory, observations.patch, observations.frame
     if memory == 0.0 or len(patch) == 0:
         return []
@@ -192,7 +192,7 @@ def _kept(observations: PhotometricObservations) -> list[Array]:
 
 
 def _remembered(kept: Sequence[Array], grey: Array) -> Array:
-    """Brightness (n,) or (n, k) with its lags; lag[i] += kept[i] lag[i − 1], by doubling."""
+    """Brightness (n,) or (n, k) plus its lag; lag[i] += kept[i] lag[i − 1], by doubling."""
     if not kept:
         return grey
     columns = (-1, *(1,) * (grey.ndim - 1))
@@ -204,14 +204,14 @@ def _remembered(kept: Sequence[Array], grey: Array) -> Array:
 
 
 def residuals(observations: PhotometricObservations, profile: CameraProfile) -> Array:
-    """Measured − predicted mean grey of the patches, grey levels of 255, (n,); each patch's light profiled out."""
+    """Measured − predicted mean grey of the patches, grey levels of 255, (n,), with each patch's light profiled out."""
     return predict(observations, profile).residual
 
 
 def normalised_rms(observations: PhotometricObservations, profile: CameraProfile) -> tuple[float, float]:
-    """(RMS of residuals, RMS of their noise), grey levels, robust: residuals beyond 5 noises count as 5.
+    """(rms of the residuals, rms of their noise), grey levels; residuals are capped at 5 noise σ.
 
-    Each patch's light takes one degree of freedom, which both figures account for.
+    The first is corrected for the degree of freedom that each patch's light takes.
     """
     limit = 5 * observations.noise
     left = np.clip(residuals(observations, profile), -limit, limit)
@@ -227,14 +227,14 @@ def _patch_sum(patch: Indices, values: Array) -> Array:
 
 @lru_cache(maxsize=16)
 def _tables(curve: ResponseCurve) -> tuple[Array, Array]:
-    """Grey (255) and its slope per log light on the grid; the grey is kept strictly rising for the inverse."""
+    """(grey of 255, its slope per log light) on the grid; the grey is made strictly increasing, for the inverse."""
     grey = 255.0 * np.asarray(curve.encode(np.exp(_LOG_LIGHT)), float)
     slope = np.gradient(grey, _LOG_LIGHT)
     return grey + 1e-9 * np.arange(len(grey)), np.maximum(slope, _LEAST_SLOPE)
 
 
 def _at(tables: tuple[Array, Array], log_light: Array) -> tuple[Array, Array]:
-    """Grey and its slope by linear interpolation on the even grid, ends held."""
+    """Grey and its slope by linear interpolation on the uniform grid, constant beyond its ends."""
     step = _LOG_LIGHT[1] - _LOG_LIGHT[0]
     position = np.clip((log_light - _LOG_LIGHT[0]) / step, 0, len(_LOG_LIGHT) - 1.001)
     index = position.astype(np.intp)

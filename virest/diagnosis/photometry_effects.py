@@ -1,4 +1,4 @@
-"""The photometric effects (contract, section 4): where each value goes in a profile, where a fit may start."""
+"""The photometric effects (contract, section 4): where each value goes in a profile, and where a fit may start."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import ROW_MIDDLE
 
 _SCAN_OBSERVATIONS = 7_000
-"""Enough to find a frequency; larger temporary arrays are allocated anew each time, ten times slower."""
+"""Enough to find a frequency; larger temporary arrays are reallocated each time, which is ten times slower."""
 _SCAN_STEP_CYCLES = 0.3
-"""Scan step as a product with the capture's length, cycles."""
+"""Frequency step of the scan times the length of the capture, cycles."""
 _LEAST_SINC = 0.03
-"""An exposure of nearly whole periods leaves less of the flicker than this: such frequencies are not searched."""
+"""Skip frequencies of which the exposure leaves less than this fraction: it lasts nearly a whole number of periods."""
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 
@@ -38,21 +38,21 @@ class PhotometricEffect(Protocol):
 
     @property
     def scale(self) -> Array:
-        """Typical size of a change of each value."""
+        """Typical change of each value."""
         ...
 
     @property
     def per_frame(self) -> bool:
-        """Whether each value belongs to one frame only, so that other frames cannot judge it; other places can."""
+        """Whether each value belongs to one frame only, so that other image regions must judge it, not other frames."""
         ...
 
     @property
     def bounds(self) -> Bounds:
-        """Least and greatest of each value."""
+        """Minimum and maximum of each value."""
         ...
 
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """Values from which a fit may begin, best first."""
+        """Starting values of a fit, best first."""
         ...
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
@@ -62,7 +62,7 @@ class PhotometricEffect(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _OneValue:
-    """An effect of one value that the profile has."""
+    """An effect with a single value, which every profile has."""
 
     name: str
     size: float
@@ -72,7 +72,7 @@ class _OneValue:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """As the table of effects has it."""
+        """As in the table of effects."""
         return tuple(parameter.name for parameter in EFFECTS[self.name].parameters)
 
     @property
@@ -81,7 +81,7 @@ class _OneValue:
         return np.array([self.size])
 
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """What the profile has."""
+        """The profile's value."""
         return [np.array(list(EFFECTS[self.name].read(profile, profile).values()))]
 
 
@@ -91,7 +91,7 @@ def _bent(profile: CameraProfile, **changes: Any) -> CameraProfile:
 
 @dataclass(frozen=True, slots=True)
 class ResponseGamma(_OneValue):
-    """Another gamma on top of the profile's curve."""
+    """An additional gamma on the profile's curve."""
 
     name: str = "response_curve"
     size: float = 0.1
@@ -104,7 +104,7 @@ class ResponseGamma(_OneValue):
 
 @dataclass(frozen=True, slots=True)
 class BlackLevel(_OneValue):
-    """Grey where there is no light: a change of two grey levels or so."""
+    """Grey level without light; its typical change is 2.5 of 255 levels."""
 
     name: str = "black_level"
     size: float = 0.01
@@ -130,7 +130,7 @@ class Vignetting(_OneValue):
 
 @dataclass(frozen=True, slots=True)
 class Flicker:
-    """Flickering lamps."""
+    """Flicker of the lighting."""
 
     name: str = "flicker"
     parameters: tuple[str, ...] = ("amplitude", "frequency_hz", "phase_rad")
@@ -138,11 +138,11 @@ class Flicker:
     bounds: Bounds = ((-0.95, 1.0, -np.inf), (0.95, np.inf, np.inf))
     search_hz: tuple[float, float] = (20.0, 400.0)
     candidates: int = 4
-    """How many peaks of the scan a fit begins at: aliases of each other look alike until they are refined."""
+    """Number of scan peaks from which fits start: aliases look alike until they are refined."""
 
     @property
     def scale(self) -> Array:
-        """A twentieth of the light, a tenth of a hertz, a tenth of a radian."""
+        """0.05 of the light, 0.1 Hz, 0.1 rad."""
         return np.array([0.05, 0.1, 0.1])
 
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
@@ -154,7 +154,7 @@ class Flicker:
         return [scan.start(i) for i in scan.peaks(self.candidates)] or [np.array([0.0, 100.0, 0.0])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """A negative amplitude is a positive one half a period later."""
+        """Set the flicker extensions; a negative amplitude is a positive one half a period later."""
         amplitude, frequency, phase = (float(v) for v in values)
         phase = float(np.mod(phase + (np.pi if amplitude < 0 else 0.0), 2 * np.pi))
         return extended(
@@ -167,7 +167,7 @@ class Flicker:
 
 @dataclass(frozen=True, slots=True)
 class GainDrift:
-    """One factor on the light per frame, in log light; only differences between frames are observable: median 1."""
+    """One factor on the light per frame, as log gain; only differences are observable, so the median gain is 1."""
 
     frames: tuple[int, ...]
     """Movie indices that have a value."""
@@ -182,37 +182,37 @@ class GainDrift:
 
     @property
     def scale(self) -> Array:
-        """A tenth of the light."""
+        """0.1 in log light."""
         return np.full(len(self.frames), 0.1)
 
     @property
     def bounds(self) -> Bounds:
-        """None."""
+        """Unbounded."""
         return (-np.inf,) * len(self.frames), (np.inf,) * len(self.frames)
 
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """What the profile has."""
+        """The profile's gains."""
         gain = np.append(profile.extensions.gain, 1.0)
         return [np.log(gain[np.minimum(self.frames, len(gain) - 1)])]
 
     def seen_in(self, observations: PhotometricObservations) -> GainDrift:
-        """The effect with values for those of its frames that are observed; the others' are not determined."""
+        """The effect with values for its observed frames only; those of other frames are not determined."""
         seen = set(observations.frames.tolist())
         return GainDrift(tuple(k for k in self.frames if k in seen), self.movie_frames)
 
     def columns(self, observations: PhotometricObservations) -> Array:
-        """Derivative of the log light factor by the values, (n, k)."""
+        """(n, k) derivative of the log light factor with respect to the values."""
         return np.asarray((observations.frame[:, None] == np.array(self.frames)).astype(float))
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Median 1 over the movie."""
+        """Set extensions.gain, with median 1 over the movie."""
         log_gain = np.interp(np.arange(self.movie_frames), self.frames, values)
         gain = np.exp(np.clip(log_gain - np.median(log_gain), -3.0, 3.0))
         return extended(profile, gain=tuple((gain / np.median(gain)).tolist()))
 
 
 def photometric_effects(observations: PhotometricObservations, movie_frames: int) -> tuple[PhotometricEffect, ...]:
-    """All effects that brightness can tell of; without logged exposure and ISO no gain can be unexplained."""
+    """All effects that brightness can reveal; a gain is unexplained only if exposure and ISO are logged."""
     frames = tuple(observations.frames.tolist())
     common: tuple[PhotometricEffect, ...] = (ResponseGamma(), BlackLevel(), Vignetting(), Flicker())
     return (*common, GainDrift(frames, movie_frames)) if observations.product_known and frames else common
@@ -223,23 +223,23 @@ def photometric_effects(observations: PhotometricObservations, movie_frames: int
 
 @dataclass(frozen=True, slots=True)
 class FlickerScan:
-    """Reduction of the residuals by a sine of each frequency."""
+    """Reduction of the residuals by a sine at each frequency."""
 
     frequency_hz: Array
     power: Array
-    """Fall of the weighted sum of squares; under noise alone a chi-squared of two degrees of freedom."""
+    """Reduction of the weighted sum of squares; for noise alone, chi-squared with two degrees of freedom."""
     amplitude: Array
-    """Of the light, corrected for what the exposure averages away; 0 where it averages away everything."""
+    """Of the light, corrected for averaging over the exposure; 0 where nothing is left after averaging."""
     phase_rad: Array
 
     def peaks(self, count: int) -> list[int]:
-        """Positions of the highest local maxima."""
+        """Indices of the highest local maxima."""
         inner = (self.power[1:-1] >= self.power[:-2]) & (self.power[1:-1] > self.power[2:])
         top = np.flatnonzero(inner & (self.amplitude[1:-1] > 0)) + 1
         return [int(i) for i in top[np.argsort(-self.power[top])][:count]]
 
     def start(self, position: int) -> Array:
-        """(amplitude, frequency, phase) there."""
+        """(amplitude, frequency, phase) at an index, with the amplitude limited to 0.6."""
         found = self.amplitude[position], self.frequency_hz[position], self.phase_rad[position]
         return np.array([min(found[0], 0.6), *found[1:]])
 
@@ -247,7 +247,7 @@ class FlickerScan:
 def scan_flicker(
     observations: PhotometricObservations, profile: CameraProfile, search_hz: tuple[float, float]
 ) -> FlickerScan:
-    """Fit a sine of each frequency to the residuals in log light by least squares, the patches' light following."""
+    """Fit a sine at each frequency to the residuals in log light by least squares, with the patches' light refitted."""
     weight = 1 / observations.noise**2
     prediction = predict(observations, profile)
     limit = 4 * observations.noise + 2.0
@@ -268,7 +268,7 @@ def scan_flicker(
 
 
 def _sines(patch: Any, values: Array, stiffness: Array, time_s: Array, frequency: Array) -> tuple[Array, Array]:
-    """Coefficients (m, 2) of sin and cos at each frequency and the power they take; patch means are taken off."""
+    """(coefficients (m, 2) of sin and cos at each frequency, power (m,) that they explain); patch means are removed."""
     dense = np.unique(patch, return_inverse=True)[1]
     order = np.argsort(dense, kind="stable")
     dense, values, stiffness, time_s = dense[order], values[order], stiffness[order], time_s[order]

@@ -1,6 +1,6 @@
 """Fits of photometric effects, their covariances, and their gains on held-out observations.
 
-Residuals are in units of their noise, each patch's light eliminated.  They are not independent: those of one time block
+Residuals are in noise σ, with each patch's light eliminated.  They are not independent: those of one time block
 share their frames' registration and coding, those of one patch its texture.  Covariances cluster by both (Cameron,
 Gelbach & Miller 2011, doi:10.1198/jbes.2010.07136).
 """
@@ -35,32 +35,32 @@ from virest.inference.time_blocks import halves, varied_blocks
 _MAX_STARTS = 8
 _FIRST_MEMORY, _MEMORY_SPREAD, _MOST_MEMORY = 0.2, 0.2, 0.6
 _PRIOR_SCALES = 10.0
-"""Standard deviation of a weak prior, in typical changes: it holds values that the data do not determine."""
+"""Standard deviation of a weak prior, in typical changes; it holds values that the data do not determine."""
 _SMALL_STEP = 1e-3
 _MEMORY_STEP = 0.01
 _TRIAL_OBSERVATIONS = 6_000
 _PER_FRAME = 100
-"""Observations of a frame that its own value is fitted to; more add cost and little precision."""
-MEMORY_DOUBT = 0.25
-"""One memory for a movie is a rough model of an encoder: this part of its effect on a value enters the deviation."""
-LAG_DOUBT = 0.2
-"""Part of a sudden change of a whole frame's brightness that an encoder at 0.25 bits a pixel may omit."""
+"""Observations per frame to which its own value is fitted; more add cost and little precision."""
+MEMORY_ERROR = 0.25
+"""Fraction of the encoder-memory correction treated as uncertainty: one memory per movie is a rough model."""
+LAG_ERROR = 0.2
+"""Fraction of a sudden change in a whole frame's brightness that an encoder at 0.25 bit per pixel may omit."""
 SHARED_ERRORS = 3.0
-"""Patches of one frame share errors of registration and coding, which their scatter does not show: gains of frames that
-were alike came out 1.3 to 3 times further off than it says, on movies of 1 to 0.25 bits a pixel."""
-LATE_FRAMES, CURVE_DOUBT = 0.5, 0.02
-"""Errors that changes of log exposure × ISO may cause in gains: an encoder's delay beyond its memory, in frames, and
-the error of a curve's slope and curvature."""
-NEIGHBOURS = 3.0
-"""One in so many changes from frame to frame counts as independent: each shares a frame with the next."""
+"""Patches of one frame share registration and coding errors, which their scatter does not show: on movies of 1 to
+0.25 bit per pixel, gains of frames with equal gain differed 1.3 to 3 times as much as their scatter predicts."""
+DELAY_FRAMES, CURVE_ERROR = 0.5, 0.02
+"""Errors in gains caused by changes of log exposure × ISO: the encoder's delay beyond its memory, in frames, and the
+error of the curve's slope and curvature."""
+CORRELATED_CHANGES = 3.0
+"""Number of frame-to-frame changes that count as one independent change: each shares a frame with the next."""
 BLOCKS_S = 0.3
-"""Typical length of a block of frames: longer than the correlation of hand shake and than the encoder's memory of a
-moving picture."""
+"""Typical length of a block of frames: longer than the correlation time of hand shake and the encoder's memory of a
+moving image."""
 BLOCK_LENGTHS = (1.0, 0.7, 1.25, 0.85, 1.4)
-"""Of the blocks in turn, times BLOCKS_S."""
+"""Lengths of successive blocks in units of BLOCKS_S, repeated in this order."""
 RESOLUTION = {"vignetting": 0.006, "flicker": 0.004, "response_curve": 0.01, "black_level": 0.002, "gain_drift": 0.003}
-"""A part of every standard deviation: smaller values cannot be told from effects of encoders and slightly textured
-patches, whatever the statistics say."""
+"""Component of every standard deviation: smaller values cannot be distinguished from effects of encoders and slightly
+textured patches, however small the statistical error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,17 +69,17 @@ class PhotometricFit:
 
     effects: tuple[PhotometricEffect, ...]
     values: Array
-    """(k,) of all effects, one after another."""
+    """(k,) of all effects, in their order."""
     covariance: Array
-    """(k, k); of a gain drift against the mean of its frames, which is not observable."""
+    """(k, k); that of gains is relative to the mean over their frames, which is not observable."""
     profile: CameraProfile
     """The profile with the values in it."""
     rms: float
-    """Of the residuals, grey levels, robust."""
+    """Robust rms of the residuals, grey levels."""
     cost: float
-    """Sum of the robust losses, in noises squared."""
+    """Sum of the robust losses, in squared noise σ."""
     memory: float
-    """Of the encoder; found along with the values, its uncertainty is in their covariance."""
+    """Encoder memory, fitted with the values; its uncertainty is in their covariance."""
 
     @property
     def std(self) -> Array:
@@ -113,7 +113,7 @@ def fit_photometry(
     effects: Sequence[PhotometricEffect],
     use: Mask | None = None,
 ) -> PhotometricFit:
-    """Fit all values of the effects together, from every start the effects name, and keep the best."""
+    """Fit all values of the effects together, from the combinations of the effects' starts, and keep the best fit."""
     chosen = _fitted_part(observations if use is None else observations.subset(use), effects)
     effects = tuple(e.seen_in(chosen) if isinstance(e, GainDrift) else e for e in effects)
     all_starts = product(*(effect.starts(chosen, profile) for effect in effects))
@@ -133,10 +133,10 @@ def pulls(
     fitted: PhotometricFit,
     changed: Sequence[tuple[CameraProfile, float]],
 ) -> Array:
-    """How a fit's values follow other values of the profile, to first order, (k, m).
+    """First-order sensitivity (k, m) of the fitted values to m other values of the profile.
 
-    changed: the profile that was fitted with one other value larger by a step, and the step, for each of the m.
-    What all values per frame have in common is not observable and left out.
+    changed: for each of the m values, the fitted profile with that value increased by a step, and the step.
+    The common part of all values per frame is not observable and is removed.
     """
     values = np.append(fitted.values, fitted.memory)
     evidence = _Brightness(_fitted_part(observations, fitted.effects), profile, fitted.effects, values)
@@ -156,10 +156,10 @@ def judge(
     beside: Sequence[PhotometricEffect] = (),
     by_side: bool | None = None,
 ) -> HeldOutGain:
-    """Fit on one half, judge on the other, and the reverse.  beside: effects that are in already.
+    """Fit on one half, judge on the other, and vice versa.  beside: effects already accepted.
 
-    by_side: the halves are sides of the frame instead of time blocks: what a shadow mimics on one side does not hold
-    on the other.  None: for effects with a value per frame, which no other frame determines.
+    by_side: the halves are sides of the frame instead of time blocks: an effect that a shadow mimics on one side fails
+    on the other.  None: by side for effects with a value per frame, which no other frame determines.
     """
     by_side = any(effect.per_frame for effect in effects) if by_side is None else by_side
     both = _sides(observations) if by_side else halves(time_blocks(observations))
@@ -175,13 +175,13 @@ def judge(
 
 
 def _sides(observations: PhotometricObservations) -> list[Mask]:
-    """Left and right, upper and lower half of the observations, (n,) each."""
+    """Masks (n,) of the right, left, lower and upper half of the observations."""
     lower = [at > np.median(at) for at in (observations.x_px, observations.y_px)]
     return [side for half in lower for side in (half, ~half)]
 
 
 def significance(fit: PhotometricFit, effect_name: str, observations: PhotometricObservations) -> tuple[float, float]:
-    """(how many standard deviations from no effect, p value), RESOLUTION and the search for a frequency counted in."""
+    """(normal deviate equivalent to the p value, p value of no effect); includes RESOLUTION and frequency search."""
     values, covariance = fit.of(effect_name)
     if effect_name == "flicker":
         z2 = values[0] ** 2 / covariance[0, 0]
@@ -199,27 +199,27 @@ def significance(fit: PhotometricFit, effect_name: str, observations: Photometri
 
 
 def _p_of_gains(observations: PhotometricObservations, log_gain: Array, covariance: Array) -> float:
-    """P-value of frames' gains against errors and what curve and encoder make of exposure × ISO.
+    """p value of a constant gain, given the errors of the gains, and of curve and encoder where exposure × ISO changes.
 
     Frames of one time block share errors, so each block counts once.  Shared errors cancel from one frame to the next,
-    so fast changes are tested separately; neighbouring changes have a frame in common, so a third of them counts.
+    so fast changes are tested separately; neighbouring changes share a frame, so one third of them count.
     """
     product = _per_frame(observations, observations.log_product)
     rounding = _per_frame(observations, observations.log_product_std)
     late = product - _frames_before(product, 1)
-    followed = np.stack([CURVE_DOUBT * product, CURVE_DOUBT * product**2, LATE_FRAMES * late], axis=-1)
+    followed = np.stack([CURVE_ERROR * product, CURVE_ERROR * product**2, DELAY_FRAMES * late], axis=-1)
     spread = covariance + followed @ followed.T + np.diag(rounding**2)
     off = log_gain - np.mean(log_gain)
     freedom = max(len(off) - 1, 1)
-    stretches = min(len(np.unique(time_blocks(observations))), freedom)
+    blocks = min(len(np.unique(time_blocks(observations))), freedom)
     slow = float(off @ np.linalg.solve(spread, off)) / freedom
     quick = _quick_changes(log_gain, spread - _lag_of_gains(log_gain, np.abs(late)))
-    tests = ((slow, stretches), (quick, max(freedom / NEIGHBOURS, 1.0)))
+    tests = ((slow, blocks), (quick, max(freedom / CORRELATED_CHANGES, 1.0)))
     return float(min(1.0, 2 * min(chi2_tail(ratio * count, count) for ratio, count in tests)))
 
 
 def _quick_changes(log_gain: Array, spread: Array) -> float:
-    """Mean square of the changes between neighbouring frames, in their variances."""
+    """Mean squared change between neighbouring frames, in units of its variance."""
     if len(log_gain) < 2:
         return 0.0
     variance = spread.diagonal()[1:] + spread.diagonal()[:-1] - 2 * spread.diagonal(1)
@@ -227,14 +227,14 @@ def _quick_changes(log_gain: Array, spread: Array) -> float:
 
 
 def _lag_of_gains(log_gain: Array, exposed: Array) -> Array:
-    """Covariance that an encoder's lag behind the gains' own changes adds; zero without gains."""
+    """Covariance added by the encoder's lag behind changes of the gains themselves; zero without gains."""
     own = np.abs(log_gain - _frames_before(log_gain, 1))
     centre = np.eye(len(own)) - 1 / len(own)
-    return np.asarray(centre @ np.diag(LAG_DOUBT**2 * ((own + exposed) ** 2 - exposed**2)) @ centre)
+    return np.asarray(centre @ np.diag(LAG_ERROR**2 * ((own + exposed) ** 2 - exposed**2)) @ centre)
 
 
 def _frames_before(values: Array, frames: int) -> Array:
-    """The values (n,) a given number of frames before; the first holds before it."""
+    """The values (n,) a number of frames earlier; the first value is repeated at the start."""
     return np.concatenate([np.repeat(values[:1], frames), values])[: len(values)]
 
 
@@ -243,21 +243,21 @@ def _per_frame(observations: PhotometricObservations, values: Array) -> Array:
 
 
 def _seen_twice(held: PhotometricObservations) -> PhotometricObservations:
-    """The mask without patches that are held out only once: a single observation has no residual."""
+    """The observations without patches that are held out only once: a single observation has no residual."""
     return held.subset(np.bincount(held.patch)[held.patch] >= 2)
 
 
 def _fitted_part(
     observations: PhotometricObservations, effects: Sequence[PhotometricEffect]
 ) -> PhotometricObservations:
-    """The observations that a fit uses: all, or enough of each frame for effects with values per frame."""
+    """The observations used by a fit: all, or enough of each frame if an effect has a value per frame."""
     if any(effect.per_frame for effect in effects):
         return _thinned(observations, _PER_FRAME * len(observations.frames))
     return observations
 
 
 def _thinned(observations: PhotometricObservations, limit: int) -> PhotometricObservations:
-    """About as many observations as the limit says: some of the places, odd and even ones alike."""
+    """Thin the observations to about ``limit``, by places, odd and even ones alike."""
     thin = max(1, len(observations) // limit)
     return observations if thin == 1 else observations.subset((observations.place // 2) % thin == 0)
 
@@ -268,7 +268,7 @@ def _best_start(
     effects: Sequence[PhotometricEffect],
     starts: list[Array],
 ) -> Array:
-    """Descend from each start on a part of the places, and go on from the best."""
+    """The state reached by the best of the descents from each start, on a part of the places."""
     if len(starts) == 1:
         return starts[0]
     part = _thinned(observations, _TRIAL_OBSERVATIONS)
@@ -280,13 +280,13 @@ def _best_start(
 
 
 def _parts(effects: Sequence[PhotometricEffect]) -> Iterator[tuple[PhotometricEffect, slice]]:
-    """Each effect, and where its values lie among all."""
+    """Each effect with the slice of its values."""
     return zip(effects, slices(len(effect.parameters) for effect in effects), strict=True)
 
 
 @dataclass(frozen=True, slots=True)
 class _Brightness:
-    """Observations and the constants of a descent; values (k + 1,): the effects', then the memory."""
+    """Observations and constants of a fit; values (k + 1,): the effects', then the encoder memory."""
 
     observations: PhotometricObservations
     profile: CameraProfile
@@ -301,16 +301,16 @@ class _Brightness:
         return profile
 
     def predicted(self, values: Array, weight: Array) -> Prediction:
-        """What the values make of the observations; weight: (n,) of each in its patch's light, beside its noise."""
+        """Prediction under some values; weight (n,) multiplies 1 / noise² in the fit of each patch's light."""
         seen = self.observations.with_memory(float(values[-1]))
         return predict(seen, self.applied(values), weight / seen.noise**2)
 
     def left(self, values: Array, weight: Array) -> Array:
-        """Measured minus predicted (n,), in noises."""
+        """Measured − predicted (n,), in noise σ."""
         return self.predicted(values, weight).residual / self.observations.noise
 
     def look(self, values: Array, before: Residuals | None = None, limit: Slopes = Slopes.HERE) -> Residuals:
-        """Residuals whose robust weights the patches' light takes into account too."""
+        """Residuals; the patches' light is fitted with the same robust weights."""
         weight = np.ones(len(self.observations))
         for _ in range(2):
             left = self.left(values, weight)
@@ -320,7 +320,7 @@ class _Brightness:
         return Residuals(left, self._slope(values, weight), left)
 
     def _slope(self, values: Array, weight: Array) -> Array:
-        """Change (n, k) of the prediction per unit of each value, in noises; exact for gains."""
+        """Derivative (n, k) of the prediction with respect to each value, in noise σ; exact for gains."""
         slope, noise = np.zeros((len(weight), len(values))), self.observations.noise
         steps = np.append(np.zeros(len(values) - 1), _MEMORY_STEP)
         for effect, own in _parts(self.effects):
@@ -340,7 +340,7 @@ class _Brightness:
         return slope
 
     def weighed(self, values: Array, look: Residuals) -> System[Array, Residuals]:
-        """The noise is known; each value, and the memory, is held weakly to where it began."""
+        """Unit scale, since the noise is known; a weak prior holds each value, and the memory, to its start."""
         spread = [_PRIOR_SCALES * effect.scale for effect in self.effects]
         prior = 1 / np.concatenate([*spread, [_MEMORY_SPREAD]]) ** 2
         low, high = self._bounds
@@ -362,9 +362,9 @@ class _Brightness:
 
 
 def _covariance(evidence: _Brightness, found: System[Array, Residuals]) -> Array:
-    """Sandwich of the scores summed over blocks of time and over places; never below what white noise gives.
+    """Sandwich covariance with scores clustered by time block and by place; never below that of white noise.
 
-    Values per frame leave nothing of a block's sum, so with them only places count.
+    Values per frame make the score sums of a block vanish, so with them only places are clusters.
     """
     observations, effects, values = evidence.observations, evidence.effects, found.state
     score, by_frame = found.score, any(effect.per_frame for effect in effects)
@@ -373,9 +373,11 @@ def _covariance(evidence: _Brightness, found: System[Array, Residuals]) -> Array
         spread = spread + scatter(score, time_blocks(observations)) - score.T @ score
     white: Array = found.inverse() * max(float(np.sum(found.weight * found.squared) / np.sum(found.weight)), 1.0)
     sandwich = found.sandwich(spread)
-    doubt = MEMORY_DOUBT * values[-1] * _pull_of_memory(found.normal)
-    lag = LAG_DOUBT * _changes(observations, effects, values)
-    model = np.outer(doubt, doubt) + np.diag(lag**2) + _resolution(observations, evidence.profile, effects, values)
+    by_memory = MEMORY_ERROR * values[-1] * _memory_sensitivity(found.normal)
+    lag = LAG_ERROR * _changes(observations, effects, values)
+    model = (
+        np.outer(by_memory, by_memory) + np.diag(lag**2) + _resolution(observations, evidence.profile, effects, values)
+    )
     if not by_frame:
         return raised(sandwich, white) + model
     shared, frames = np.ones(len(values)), _centring(effects)
@@ -386,22 +388,23 @@ def _covariance(evidence: _Brightness, found: System[Array, Residuals]) -> Array
 def _resolution(
     observations: PhotometricObservations, profile: CameraProfile, effects: Sequence[PhotometricEffect], values: Array
 ) -> Array:
-    """Covariance (k + 1, k + 1) that RESOLUTION adds to that of the values and the memory."""
+    """Covariance (k + 1, k + 1) that RESOLUTION adds to the values and the memory."""
     added = np.zeros((len(values), len(values)))
     for effect, own in _parts(effects):
         square = RESOLUTION[effect.name] ** 2
         if effect.name == "flicker":
-            added[own, own] = square * _pulse_resolution(observations, profile, float(values[own.start]))
+            added[own, own] = square * _flicker_resolution(observations, profile, float(values[own.start]))
         else:
             added[own, own] = np.diag(np.full(len(effect.parameters), square))
     return added
 
 
-def _pulse_resolution(observations: PhotometricObservations, profile: CameraProfile, amplitude: float) -> Array:
-    """What an error ε of a flicker's complex amplitude does to (amplitude, frequency, phase), (3, 3), over ε².
+def _flicker_resolution(observations: PhotometricObservations, profile: CameraProfile, amplitude: float) -> Array:
+    """Covariance (3, 3) of (amplitude, frequency, phase), over ε², from an error ε of a flicker's complex amplitude.
 
-    Across the amplitude it turns the phase at the capture's middle by ε / amplitude.  If it changes on the way, as an
-    encoder's does, with the same mean, it turns the frequency by √12 / (2π duration) of that; the phase at time 0 too.
+    A component across the amplitude changes the phase at the middle of the capture by ε / amplitude.  If it varies over
+    the capture with the same mean, as an encoder's error does, it changes the frequency by √12 / (2π duration) times
+    that, and with it the phase at time 0.
     """
     time_s = observations.row_time_s(profile)
     middle, duration = float(time_s.mean()), max(float(np.ptp(time_s)), 0.1)
@@ -411,7 +414,7 @@ def _pulse_resolution(observations: PhotometricObservations, profile: CameraProf
 
 
 def _changes(observations: PhotometricObservations, effects: Sequence[PhotometricEffect], values: Array) -> Array:
-    """Change of each frame's brightness from the frame before, by its own value and by exposure × ISO.
+    """Absolute change of each frame's log brightness since the frame before, by its own value and by exposure × ISO.
 
     0 for all other values and the memory.
     """
@@ -424,14 +427,14 @@ def _changes(observations: PhotometricObservations, effects: Sequence[Photometri
 
 
 def _exposure_steps(observations: PhotometricObservations, frames: Sequence[int]) -> Array:
-    """Change (k,) of the logarithm of exposure × ISO at each of some frames, all observed, from the one before."""
+    """Absolute change (k,) of log exposure × ISO at each of some observed frames since the last; 0 for the first."""
     seen = observations.subset(np.isin(observations.frame, frames))
     product = _per_frame(seen, seen.log_product)
     return np.abs(product - _frames_before(product, 1))
 
 
 def _centring(effects: Sequence[PhotometricEffect]) -> Array:
-    """Matrix (k + 1, k + 1) that takes the mean off the values per frame and leaves the others."""
+    """Matrix (k + 1, k + 1) that subtracts the mean from the values per frame and keeps the others."""
     matrix = np.eye(sum(len(effect.parameters) for effect in effects) + 1)
     for effect, own in _parts(effects):
         if effect.per_frame:
@@ -439,8 +442,8 @@ def _centring(effects: Sequence[PhotometricEffect]) -> Array:
     return matrix
 
 
-def _pull_of_memory(normal: Array) -> Array:
-    """How the other values change with the memory, to first order, (k,); 0 for the memory itself."""
+def _memory_sensitivity(normal: Array) -> Array:
+    """First-order sensitivity (k + 1,) of the values to the memory; 0 for the memory itself."""
     pull: Array = np.zeros(len(normal))
     if len(normal) > 1:
         pull[:-1] = -np.linalg.solve(normal[:-1, :-1], normal[:-1, -1])

@@ -18,11 +18,11 @@ from virest.diagnosis.photometry import Array, Indices, PhotometricObservations
 from virest.inference.robust import MEDIAN_TO_STD
 
 _MOST_ROW_KNOTS = 17
-"""Lamps pulse two or three times in a readout, which this many knots represent."""
+"""Maximum number of row knots; lamps pulse two or three times per readout, which this many knots represent."""
 _PLACES_PER_TERM = 3.0
-"""A field has at most one term for this many places of its frame: the three colours of a place are not independent."""
+"""Minimum number of places of a frame per term of its field; the three channels of a place are not independent."""
 _PRIOR_COUNT = 6.0
-"""Weight of the frame's own noise, in observations, against that of the patch."""
+"""Weight, in observations, of the frame's noise against that of the patch."""
 _LEAST_LEVELS = 0.05
 _PASSES = 4
 _SOLVER_STEPS = 60
@@ -31,15 +31,15 @@ _SOLVER_STEPS = 60
 def measured_noise(
     observations: PhotometricObservations, curve: ResponseCurve | None = None
 ) -> PhotometricObservations:
-    """The observations with their noise: a factor per frame and one per patch, from what the free fields leave.
+    """The observations with their noise: a factor per frame times one per patch, from the residuals of the free fields.
 
-    curve: of the profile; takes off what the logged exposure × ISO does, so that a smooth field can do the rest.
+    curve: the profile's; it removes the effect of logged exposure × ISO, so that a smooth field can model the rest.
     """
     if len(observations) == 0:
         return observations
     left = _two_way_residual(observations, curve or ResponseCurve("srgb"))
     frame = np.searchsorted(observations.frames, observations.frame)
-    frame_noise = np.maximum(_spread(frame, left), _LEAST_LEVELS)[frame]
+    frame_noise = np.maximum(_robust_std(frame, left), _LEAST_LEVELS)[frame]
     ratio = np.clip(left / frame_noise, -6, 6) ** 2
     count = np.bincount(observations.patch)
     per_patch = (np.bincount(observations.patch, ratio) + _PRIOR_COUNT) / (np.maximum(count - 1, 0) + _PRIOR_COUNT)
@@ -47,10 +47,10 @@ def measured_noise(
 
 
 def _two_way_residual(observations: PhotometricObservations, curve: ResponseCurve) -> Array:
-    """(n,) what a robust joint fit of the patches' brightness and the frames' fields leaves, grey levels.
+    """(n,) residuals of a robust joint fit of patch levels and frame fields, scaled for the degrees of freedom used.
 
-    ``grey = level + change(level, exposure × ISO) + field[frame](place, row, level)``, ``level`` one value for each
-    patch.  Change and field are taken at the last pass's levels, the rest is linear least squares.
+    ``grey = level + change(level, exposure × ISO) + field[frame](place, row, level)``, grey levels; ``level`` is one
+    value per patch.  Change and field are evaluated at the previous pass's levels; the rest is linear least squares.
     """
     patch = np.unique(observations.patch, return_inverse=True)[1]
     frame = np.searchsorted(observations.frames, observations.frame)
@@ -62,7 +62,7 @@ def _two_way_residual(observations: PhotometricObservations, curve: ResponseCurv
         found = lsmr(design, weight * target, atol=1e-7, btol=1e-7, maxiter=_SOLVER_STEPS)[0]
         left = target - (design @ found) / weight
         level = level + (found[: len(scale)] * scale)[patch]
-        spread = _spread(frame, left)[frame]
+        spread = _robust_std(frame, left)[frame]
         weight = np.sqrt(1 / (1 + (left / np.maximum(2.0 * spread, _LEAST_LEVELS)) ** 2))
     places = len(np.unique(np.stack([observations.place, observations.frame]), axis=1).T)
     spent = len(np.unique(observations.place)) + design.shape[1] - len(scale)
@@ -70,7 +70,7 @@ def _two_way_residual(observations: PhotometricObservations, curve: ResponseCurv
 
 
 def _relit(grey: Array, log_light: Array, curve: ResponseCurve) -> Array:
-    """Grey levels after a change of light, by the curve."""
+    """Grey levels after a change of log light, by the curve."""
     if not log_light.any():
         return grey
     light = curve.linearise(np.clip(grey / 255.0, 0.0, 1.0)) * np.exp(log_light)
@@ -78,24 +78,24 @@ def _relit(grey: Array, log_light: Array, curve: ResponseCurve) -> Array:
 
 
 def _medians(group: Indices, values: Array) -> Array:
-    """(groups,) lower medians."""
+    """(groups,) lower median of each group."""
     order = np.lexsort((values, group))
     count = np.bincount(group)
     start = np.cumsum(count) - count
     return np.asarray(values[order][start + np.maximum(count - 1, 0) // 2])
 
 
-def _spread(group: Indices, values: Array) -> Array:
-    """(groups,) standard deviations, by the median of the sizes."""
+def _robust_std(group: Indices, values: Array) -> Array:
+    """(groups,) robust standard deviation about zero, from the lower median of the absolute values."""
     return MEDIAN_TO_STD * _medians(group, np.abs(values))
 
 
 def _design(
     observations: PhotometricObservations, patch: Indices, frame: Indices, level: Array, weight: Array
 ) -> tuple[sparse.csr_matrix, Array]:
-    """Weighted columns of all patches and of all frames' fields, each orthonormal, and the patches' scales.
+    """(weighted columns of all patches and of all frames' fields, scales of the patch columns).
 
-    Within a frame the basis is orthonormal and so are the patches among each other: LSMR then takes few steps.
+    The patch columns are orthonormal, and so is the basis within each frame: LSMR then needs few steps.
     """
     scale = 1 / np.sqrt(np.bincount(patch, weight**2))
     blocks = [sparse.csr_matrix((weight * scale[patch], (np.arange(len(patch)), patch)))]
@@ -113,9 +113,9 @@ def _design(
 
 
 def _basis(observations: PhotometricObservations, chosen: Indices, level: Array) -> Array:
-    """A cubic in brightness, and brightness times (a quadratic in place + hats along the readout).
+    """A cubic in brightness, and brightness times (a quadratic in position + hat functions along the readout).
 
-    The number of terms is limited by the frame's number of patches.
+    The number of places in the frame limits the number of terms.
     """
     size = max(observations.width, observations.height)
     x = (observations.x_px[chosen] - observations.width / 2) / size

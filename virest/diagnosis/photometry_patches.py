@@ -35,31 +35,31 @@ _LK_LEVELS = 3
 
 @dataclass(frozen=True, slots=True)
 class PatchSettings:
-    """How patches are chosen and looked up. Lengths in pixels hold for a picture 640 px long and grow with it."""
+    """How patches are chosen and found.  Lengths in pixels hold for frames 640 px long and scale with the frame."""
 
     halve_above_px: int = 1000
-    """Pictures with a longer side are halved first: patches are means over many pixels anyway."""
+    """Halve frames with a longer side than this first: patches are means over many pixels anyway."""
     patch_px: float = 11.0
     surround_px: float = 23.0
-    """Side of the square around a patch that has to be flat."""
+    """Side of the square around a patch that must be flat."""
     cells: int = 9
-    """Cells along the longer side of the picture; each gives its flattest patch."""
+    """Cells along the longer side of the frame; each contributes its flattest patch."""
     max_spread_levels: float = 8.0
     """Largest standard deviation in the surround, grey levels."""
     key_every: int = 24
     """Frames between key frames."""
     active_keys: int = 2
-    """How many key frames are looked for in each frame."""
+    """Number of key frames whose patches are searched for in each frame."""
     least_seen: int = 6
-    """Patches seen less often are dropped."""
+    """Drop patches seen less often."""
     min_corners: int = 24
     max_deviation_px: float = 1.5
-    """Frames whose corners scatter more than this about a smooth field are not compared."""
+    """Skip frames whose corners scatter more than this about a smooth field."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Key:
-    """A key frame with the patches and corners that other frames are searched for."""
+    """A key frame with the patches and corners to be found in other frames."""
 
     frame: Frame
     normal: Picture
@@ -76,12 +76,12 @@ def observe_photometry(
     settings: PatchSettings | None = None,
     intra_frames: Collection[int] = (),
 ) -> PhotometricObservations:
-    """Follow flat patches through a stream of (frame, RGB (h, w, 3) or None) in rising order, one pass.
+    """Track flat patches through a stream of (frame, RGB (h, w, 3) or None) in ascending order, in one pass.
 
-    trajectory: the camera's orientation; None: nothing is predicted, corners are followed from where they were.
-    profile: for the geometry only.  intra_frames: movie indices that the decoder can start from (Capture.keyframes);
-    they are coded on their own, and patches are best chosen there.  A picture that repeats its predecessor is passed
-    over.
+    trajectory: the camera's orientation; None: without prediction, corners are searched from their key-frame positions.
+    profile: its geometry, and its curve for the noise.  intra_frames: movie indices at which decoding can start
+    (Capture.keyframes); they are intra-coded, so patches are best chosen there.  An exact repeat of the previous
+    picture is skipped.
     """
     settings = settings or PatchSettings()
     if max(profile.width, profile.height) > settings.halve_above_px:
@@ -99,14 +99,14 @@ def observe_photometry(
             continue
         before = picture
         seen.append(frame)
-        look = _look(picture, settings)
-        found = [_seen_patches(key, frame, look, camera, settings) for key in keys]
+        maps = _patch_maps(picture, settings)
+        found = [_seen_patches(key, frame, maps, camera, settings) for key in keys]
         rows += found
         fresh = since >= settings.key_every and (frame.index in intra_frames or since >= 2 * settings.key_every)
         lost = bool(keys) and since >= settings.least_seen and len(found[-1]) < 0.5 * len(keys[-1].patches_px)
         if not keys or fresh or lost:
-            key = _make_key(frame, look, places, settings)
-            rows.append(_read(key, key.patches_px, frame, look, settings))
+            key = _make_key(frame, maps, places, settings)
+            rows.append(_read(key, key.patches_px, frame, maps, settings))
             places += len(key.patches_px)
             keys, since = [*keys, key][-settings.active_keys :], 0
         since += 1
@@ -115,7 +115,7 @@ def observe_photometry(
 
 
 def halved_profile(profile: CameraProfile) -> CameraProfile:
-    """The same camera with pictures of half the size: pixel x is then (x − ½) / 2."""
+    """The same camera with frames of half the size: pixel x becomes (x − ½) / 2."""
     width, height, lens = profile.width // 2, profile.height // 2, profile.intrinsics
     if lens is not None:
         focal, centre = (lens.fx_px / 2, lens.fy_px / 2), ((lens.cx_px - 0.5) / 2, (lens.cy_px - 0.5) / 2)
@@ -135,17 +135,17 @@ def _halved(picture: Picture | None) -> Picture | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Look:
-    """Smoothed versions of one picture."""
+class _PatchMaps:
+    """Smoothed versions of one frame, from which patches are chosen and read."""
 
     mean: NDArray[np.float32]
-    """(h, w, 3) mean over the patch's square."""
+    """(h, w, 3) mean over the patch square."""
     spread: NDArray[np.float32]
-    """(h, w) standard deviation of the grey in the patch's square."""
+    """(h, w) standard deviation of grey in the patch square."""
     surround: NDArray[np.float32]
     """(h, w) the same in the surround."""
     normal: Picture
-    """Grey picture without local mean and contrast, for following corners."""
+    """Grey image normalised by local mean and contrast, for tracking corners."""
 
 
 def _scale(width: int, height: int) -> float:
@@ -156,7 +156,7 @@ def _odd(length: float) -> int:
     return 2 * int(length / 2) + 1
 
 
-def _look(picture: Picture, settings: PatchSettings) -> _Look:
+def _patch_maps(picture: Picture, settings: PatchSettings) -> _PatchMaps:
     scale = _scale(picture.shape[1], picture.shape[0])
     side, wide = _odd(settings.patch_px * scale), _odd(settings.surround_px * scale)
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -167,7 +167,7 @@ def _look(picture: Picture, settings: PatchSettings) -> _Look:
     local = cv2.blur(gray, around)
     contrast = np.sqrt(np.maximum(cv2.blur(squared, around) - local * local, 0)) + 6.0
     normal = np.clip(128 + 45 * (gray - local) / contrast, 0, 255).astype(np.uint8)
-    return _Look(np.asarray(mean, np.float32), spread, _spread(gray, squared, far), normal)
+    return _PatchMaps(np.asarray(mean, np.float32), spread, _spread(gray, squared, far), normal)
 
 
 def _spread(gray: NDArray[np.float32], squared: NDArray[np.float32], box: tuple[int, int]) -> NDArray[np.float32]:
@@ -175,29 +175,29 @@ def _spread(gray: NDArray[np.float32], squared: NDArray[np.float32], box: tuple[
     return np.asarray(np.sqrt(np.maximum(cv2.blur(squared, box) - mean * mean, 0)), np.float32)
 
 
-def _make_key(frame: Frame, look: _Look, first_place: int, settings: PatchSettings) -> _Key:
-    corners = find_corners(look.normal, TrackingSettings(grid=(7, 7), points_per_cell=3))
-    patches = _flat_patches(look, settings)
+def _make_key(frame: Frame, maps: _PatchMaps, first_place: int, settings: PatchSettings) -> _Key:
+    corners = find_corners(maps.normal, TrackingSettings(grid=(7, 7), points_per_cell=3))
+    patches = _flat_patches(maps, settings)
     column, row = patches[:, 0].astype(int), patches[:, 1].astype(int)
-    return _Key(frame, look.normal, corners, patches, look.spread[row, column].astype(float), first_place)
+    return _Key(frame, maps.normal, corners, patches, maps.spread[row, column].astype(float), first_place)
 
 
-def _flat_patches(look: _Look, settings: PatchSettings) -> Array:
-    """Middles (n, 2) of the flattest patch of each cell, for its brightness, and of the darkest flat ones."""
-    height, width = look.normal.shape
-    brightness = look.mean.mean(axis=-1)
+def _flat_patches(maps: _PatchMaps, settings: PatchSettings) -> Array:
+    """Centres (n, 2) of the flattest patch per cell, relative to its brightness, and of the darkest flat patches."""
+    height, width = maps.normal.shape
+    brightness = maps.mean.mean(axis=-1)
     edge = int(settings.surround_px * _scale(width, height) / 2) + 1
-    allowed = (look.surround < settings.max_spread_levels) & (look.mean.max(axis=-1) < 244)
+    allowed = (maps.surround < settings.max_spread_levels) & (maps.mean.max(axis=-1) < 244)
     allowed[:edge], allowed[-edge:], allowed[:, :edge], allowed[:, -edge:] = False, False, False, False
-    relative = np.where(allowed, look.surround / (brightness + 15.0), np.inf)
-    dark = np.where(allowed & (look.surround < 0.5 * settings.max_spread_levels), brightness, np.inf)
+    relative = np.where(allowed, maps.surround / (brightness + 15.0), np.inf)
+    dark = np.where(allowed & (maps.surround < 0.5 * settings.max_spread_levels), brightness, np.inf)
     cell = max(width, height) / settings.cells
     found = {*_best_of_cells(relative, cell), *_best_of_cells(dark, 2 * cell)}
     return np.array(sorted(found), float).reshape(-1, 2)
 
 
 def _best_of_cells(score: NDArray[np.float32], cell: float) -> list[tuple[int, int]]:
-    """(x, y) of the least finite score in each cell."""
+    """(x, y) of the smallest finite score in each cell."""
     height, width = score.shape
     rows, columns = (np.linspace(0, n, max(round(n / cell), 1) + 1).astype(int) for n in (height, width))
     best = []
@@ -215,25 +215,25 @@ def _best_of_cells(score: NDArray[np.float32], cell: float) -> list[tuple[int, i
 def _seen_patches(
     key: _Key,
     frame: Frame,
-    look: _Look,
+    maps: _PatchMaps,
     camera: TurningCamera | None,
     settings: PatchSettings,
 ) -> Array:
-    """Read the key's patches in another frame; empty where the frames cannot be registered."""
+    """Read the patches of a key frame in another frame; empty if the frames cannot be registered."""
     corners = key.corners_px.astype(float)
     guess = predicted_points(corners, key.frame, frame, camera)
-    field = _deviation(key, guess, look, settings)
+    field = _deviation(key, guess, maps, settings)
     if field is None:
         return np.zeros((0, 8))
     patches = predicted_points(key.patches_px, key.frame, frame, camera)
-    height, width = look.normal.shape
-    return _read(key, patches + _smooth_basis(patches, width, height) @ field, frame, look, settings)
+    height, width = maps.normal.shape
+    return _read(key, patches + _smooth_basis(patches, width, height) @ field, frame, maps, settings)
 
 
 def predicted_points(points_px: Array, key: Frame, frame: Frame, camera: TurningCamera | None) -> Array:
-    """Positions in another frame of points (n, 2) by rotation alone, each at its own row's mid-exposure.
+    """Positions in another frame of points (n, 2), by rotation alone, each at the mid-exposure of its own row.
 
-    camera: None: where they were.
+    camera: None: the positions stay the same.
     """
     if camera is None:
         return points_px
@@ -242,22 +242,22 @@ def predicted_points(points_px: Array, key: Frame, frame: Frame, camera: Turning
 
 
 @dataclass(frozen=True, slots=True)
-class Follower:
-    """A frame and its grey picture, to be registered with another."""
+class GrayFrame:
+    """A frame and its grey image, to be registered with another."""
 
     frame: Frame
     gray: Picture
 
 
-def seen_elsewhere(
-    at: Follower, other: Follower, camera: TurningCamera, points_px: Array
+def registered_points(
+    at: GrayFrame, other: GrayFrame, camera: TurningCamera, points_px: Array
 ) -> NDArray[np.float32] | None:
-    """Positions (..., 2) in another frame of points (..., 2), corrected by corners; None: not registered."""
+    """Positions (..., 2) in another frame of points (..., 2), corrected by tracked corners; None if those fail."""
     settings = PatchSettings()
-    looks = [_look(cv2.cvtColor(one.gray, cv2.COLOR_GRAY2RGB), settings) for one in (at, other)]
-    key = _make_key(at.frame, looks[0], 0, settings)
+    both_maps = [_patch_maps(cv2.cvtColor(one.gray, cv2.COLOR_GRAY2RGB), settings) for one in (at, other)]
+    key = _make_key(at.frame, both_maps[0], 0, settings)
     guess = predicted_points(key.corners_px.astype(float), at.frame, other.frame, camera)
-    field = _deviation(key, guess, looks[1], settings)
+    field = _deviation(key, guess, both_maps[1], settings)
     if field is None:
         return None
     height, width = at.gray.shape
@@ -267,22 +267,22 @@ def seen_elsewhere(
 
 
 def path_over_exposure(points_px: Array, frame: Frame, camera: TurningCamera, instants: int = 13) -> Array:
-    """Displacements (n, instants, 2) of points seen at mid-exposure, over the exposure of their own rows."""
+    """Displacements (n, instants, 2), over the exposure of their own rows, of points given at mid-exposure."""
     at = camera.frame(frame)
     points_px = points_px[:, None]
     time_s = at.row_time_s(points_px, np.linspace(0.0, 1.0, instants))
     return moved_between(at, points_px, at.row_time_s(points_px, ROW_MIDDLE), time_s) - points_px
 
 
-def _deviation(key: _Key, guess: Array, look: _Look, settings: PatchSettings) -> Array | None:
-    """Smooth field (6, 2) of seen − predicted corners: quadratic in place, robust. None where too few agree."""
-    height, width = look.normal.shape
+def _deviation(key: _Key, guess: Array, maps: _PatchMaps, settings: PatchSettings) -> Array | None:
+    """Smooth field (6, 2) of tracked − predicted corners: quadratic in position, robust; None if too few agree."""
+    height, width = maps.normal.shape
     inside = ((guess > 0) & (guess < (width - 1, height - 1))).all(axis=-1)
     if inside.sum() < settings.min_corners:
         return None
     start = np.ascontiguousarray(guess[inside, None], np.float32)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        key.normal, look.normal, np.ascontiguousarray(key.corners_px[inside, None]), start.copy(),
+        key.normal, maps.normal, np.ascontiguousarray(key.corners_px[inside, None]), start.copy(),
         winSize=_LK_WINDOW, maxLevel=_LK_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     found = status.ravel() == 1
@@ -310,20 +310,20 @@ def _smooth_basis(points_px: Array, width: int, height: int) -> Array:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def _read(key: _Key, points_px: Array, frame: Frame, look: _Look, settings: PatchSettings) -> Array:
-    """Table (n, 8): place, frame, x, y, three means and the spread of the patches that lie well inside.
+def _read(key: _Key, points_px: Array, frame: Frame, maps: _PatchMaps, settings: PatchSettings) -> Array:
+    """Table (n, 8): place, frame, x, y, three means and the spread of each patch well inside the frame.
 
     A patch with much more contrast than in its key frame is dropped: it shows something else.
     """
-    height, width = look.normal.shape
+    height, width = maps.normal.shape
     edge = settings.surround_px * _scale(width, height) / 2
     inside = ((points_px > edge) & (points_px < (width - 1 - edge, height - 1 - edge))).all(axis=-1)
     if not inside.any():
         return np.zeros((0, 8))
     points = points_px[inside]
     at = points.astype(np.float32)[None]
-    mean = cv2.remap(look.mean, at, None, cv2.INTER_LINEAR)[0]
-    spread = cv2.remap(look.spread, at, None, cv2.INTER_LINEAR)[0]
+    mean = cv2.remap(maps.mean, at, None, cv2.INTER_LINEAR)[0]
+    spread = cv2.remap(maps.spread, at, None, cv2.INTER_LINEAR)[0]
     place = key.first_place + np.flatnonzero(inside)
     good = spread < 1.5 * key.spread[inside] + 2.0
     table = np.column_stack([place, np.full(len(place), frame.index), points, mean, spread])
@@ -340,12 +340,12 @@ def _observations(
     settings: PatchSettings,
     intra_frames: Collection[int],
 ) -> PhotometricObservations:
-    """One entry per channel; clipped ones and patches seen too rarely are left out."""
+    """One entry per channel; clipped entries and patches seen too rarely are dropped."""
     place, index = table[:, 0].astype(np.intp), table[:, 1].astype(np.intp)
     channel = np.tile(np.arange(3), len(table))
     patch = 3 * np.repeat(place, 3) + channel
     grey, spread = table[:, 4:7].ravel(), np.repeat(table[:, 7], 3)
-    # Noise clipped at zero lifts black, and at 255 lowers white.
+    # noise clipped at 0 raises the mean of black patches; clipped at 255 it lowers that of white ones
     keep = (grey - 2.5 * spread > 1.0) & (grey > 6.0) & (grey + 2.5 * spread < 250.0)
     often = np.bincount(patch[keep], minlength=int(patch.max(initial=0)) + 1) >= settings.least_seen
     keep &= often[patch]
@@ -381,7 +381,7 @@ def _observations(
 
 
 def _logged_products(frames: list[Frame]) -> tuple[Array, Array, bool]:
-    """Log of exposure × ISO against its median, what rounding the ISO leaves open, whether all frames have both."""
+    """(log exposure × ISO relative to its median, its σ from ISO rounding, whether all frames have logged both)."""
     known = bool(frames) and all(f.exposure_s and f.iso for f in frames)
     if not known:
         return np.zeros(len(frames)), np.zeros(len(frames)), False

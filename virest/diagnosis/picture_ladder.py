@@ -49,51 +49,52 @@ Picture = NDArray[np.uint8]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 MAX_RUNGS = 3
 WHOLE_LIGHT_FRAMES, MAX_LIGHT_FRAMES = 240, 130
-"""Brightness is measured in every frame of a capture of up to the first number of frames, and in one run of the second
-number in a longer one: patches are followed from frame to frame."""
+"""Captures of up to the first number of frames are measured in every frame, longer ones in one run of the second number
+of frames, because patches are tracked from frame to frame."""
 MAX_GAIN_FRAMES = 3000
-"""A gain for each frame is fitted in captures of up to this many frames."""
-SAME_SPREAD = 0.05
-"""Runs whose standard deviations of log exposure × ISO agree to this determine the curve equally well."""
+"""Gains are fitted to all frames in captures of up to this many frames, otherwise only in the run."""
+EQUAL_RANGE = 0.05
+"""Runs whose 5 to 95 % ranges of log exposure × ISO agree to this determine the curve equally well."""
 MIN_OBSERVATIONS = 300
 CURVE: dict[str, PhotometricEffect] = {"response_curve": ResponseGamma(), "black_level": BlackLevel()}
-MOST_KEPT = 0.45
-"""An encoder that keeps this part of the last picture keeps more of dark patches than of bright ones under any curve,
-which a black level would only absorb."""
+MAX_CURVE_MEMORY = 0.45
+"""Do not fit the curve if the encoder keeps more than this fraction of the last frame: it then keeps more of dark
+patches than of bright ones under any curve, and a black level would only absorb that."""
 VARIED_LIGHT = 0.25
-"""Least spread of log exposure × ISO for estimating the curve from brightness; below it, mixing by blur gives it."""
+"""Minimum 5 to 95 % range of log exposure × ISO for estimating the curve from brightness; below it, the curve is
+estimated from how blur mixes light."""
 UNEVEN = (
     "brightness changes from frame to frame, unevenly across the frame: a moving shadow "
     "or light from one side; no cause was named for it"
 )
 SOFT_Z = 5.0
-"""Above this many deviations, note possible defocus; lenses vary, so as a cause it must be more significant."""
+"""Above this many σ, note a possible defocus; as a cause it must be more significant, since lenses vary."""
 
 SENTENCES = {name: effect.sentence for name, effect in EFFECTS.items() if effect.seen_in in (PHOTOMETRY, BLUR)}
 
 
 Mixed = tuple[MixingEstimate, HeldOutGain]
-"""A change of the curve that blur shows, and what it gains."""
+"""A change of the curve estimated from blur, and its held-out gain."""
 
 
 @dataclass(slots=True)
 class PictureVerdict:
-    """The end of the ladders for brightness and blur."""
+    """Result of the ladder for brightness, blur, curve or edges."""
 
     profile: CameraProfile
     findings: list[Finding] = field(default_factory=list)
     rungs: list[Rung] = field(default_factory=list)
     observations: PhotometricObservations | None = None
     fitted: PhotometricFit | None = None
-    """Of brightness: all causes named, together."""
+    """Joint fit of all accepted causes of brightness."""
     mixed: dict[str, Mixed] = field(default_factory=dict)
-    """What blur says of the curve, by cause, named or not."""
+    """By cause: change of the curve estimated from blur, reported or not."""
     photometric_rms: float | None = None
     blur_rms_px: float | None = None
     edges: local_blur.BlurObservations | None = None
-    """Of blur: what was measured."""
+    """The measured local blur."""
     steps: IsolatedSteps | None = None
-    """Of the pictures that blur was measured in; None: in none."""
+    """Isolated steps of the frames in which blur was measured; None: not measured."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -103,15 +104,15 @@ class PictureVerdict:
 def light_stretch(frames: Sequence[Frame]) -> list[Frame]:
     """Frames for the brightness ladder: all of a short capture, else the run over which exposure × ISO varies most.
 
-    Of runs that agree in this it is the one nearest to the middle.
+    Among equal runs, the one nearest the middle is taken.
     """
     if len(frames) <= WHOLE_LIGHT_FRAMES:
         return list(frames)
     light = np.log([(frame.exposure_s or 1.0) * (frame.iso or 1.0) for frame in frames])
     starts = np.unique(np.linspace(0, len(frames) - MAX_LIGHT_FRAMES, 33).round().astype(int))
     spread = np.array([np.ptp(np.quantile(light[k : k + MAX_LIGHT_FRAMES], [0.05, 0.95])) for k in starts])
-    alike = starts[spread >= spread.max() - SAME_SPREAD]
-    begin = int(alike[np.argmin(np.abs(alike - (len(frames) - MAX_LIGHT_FRAMES) / 2))])
+    equal = starts[spread >= spread.max() - EQUAL_RANGE]
+    begin = int(equal[np.argmin(np.abs(equal - (len(frames) - MAX_LIGHT_FRAMES) / 2))])
     return list(frames[begin : begin + MAX_LIGHT_FRAMES])
 
 
@@ -123,16 +124,16 @@ def climb_light(
     rgb: Reader,
     each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
-    """Find the causes of brightness changes, on a run of a long capture; gains per frame then on the whole capture."""
-    looked = light_stretch(frames)
-    found = climb_photometry(capture, looked, profile, trajectory, rgb, each)
-    if len(looked) == len(frames):
+    """Find the causes of brightness changes; in a long capture on a run, and per-frame gains then on all frames."""
+    run = light_stretch(frames)
+    found = climb_photometry(capture, run, profile, trajectory, rgb, each)
+    if len(run) == len(frames):
         return found
     gains = any(finding.name == "gain_drift" for finding in found.findings)
     if gains and len(frames) <= MAX_GAIN_FRAMES:
         return climb_photometry(capture, frames, profile, trajectory, rgb, each)
-    span = f"frames {looked[0].index} to {looked[-1].index}"
-    note = f"brightness was judged in {len(looked)} of {len(frames)} frames, {span}"
+    span = f"frames {run[0].index} to {run[-1].index}"
+    note = f"brightness was judged in {len(run)} of {len(frames)} frames, {span}"
     found.notes.append(f"{note}; the other frames use the gain of the nearest judged frame" if gains else note)
     return found
 
@@ -145,7 +146,7 @@ def climb_photometry(
     rgb: Reader,
     each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
-    """Find what changes the brightness of patches; frames at their true times."""
+    """Find what changes the brightness of patches; the frames have their true timestamps."""
     verdict = PictureVerdict(profile)
     if not frames:
         verdict.notes.append("no frame at a known time: brightness not judged")
@@ -168,7 +169,7 @@ def climb_photometry(
 def climb_observations(
     verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int, each: ParallelMap = one_by_one
 ) -> None:
-    """Enter into the verdict what the brightness of patches says."""
+    """Add to the verdict the causes that the brightness of patches shows."""
     nominal = verdict.profile
     verdict.photometric_rms = normalised_rms(observations, nominal)[0]
     effects = photometric_effects(observations, movie_frames)
@@ -196,7 +197,7 @@ def climb_observations(
 
 
 def light_varies(observations: PhotometricObservations) -> bool:
-    """Whether exposure × ISO changes enough for the curve to be read from brightness."""
+    """Whether exposure × ISO varies enough to estimate the curve from brightness."""
     spread = np.quantile(observations.log_product, [0.05, 0.95])
     return bool(spread[1] - spread[0] >= VARIED_LIGHT)
 
@@ -210,9 +211,10 @@ def _rung(
     each: ParallelMap,
     notes: list[str] | None = None,
 ) -> tuple[Rung, PhotometricEffect | None, PhotometricFit]:
-    """Fit every cause beside those in, by a penalised loss; judge the best on blocks that took no part.
+    """Fit every cause beside the accepted ones, and judge the two with the lowest penalised loss on held-out data.
 
-    notes: takes what changes brightness from frame to frame and is no gain of whole frames.
+    Returns (rung, cause that enters or None, its fit).  notes: receives a note if brightness changes from frame to
+    frame, but not by one gain for the whole frame.
     """
     before = normalised_rms(observations.with_memory(plain.memory), plain.profile)[0]
     others = [e for e in effects if e not in accepted]
@@ -225,8 +227,8 @@ def _rung(
     for name in order[:2]:
         effect = next(e for e in effects if e.name == name)
         p_value = significance(fits[name], name, observations)[1]
-        forgetful = name not in CURVE or fits[name].memory <= MOST_KEPT
-        if fits[name].cost >= plain.cost or not LIGHT_LEVELS.significant(p_value) or not forgetful:
+        low_memory = name not in CURVE or fits[name].memory <= MAX_CURVE_MEMORY
+        if fits[name].cost >= plain.cost or not LIGHT_LEVELS.significant(p_value) or not low_memory:
             continue
         if _holds(observations, nominal, accepted, effect, each):
             return replace(nothing, entered=name), effect, fits[name]
@@ -242,7 +244,7 @@ def _holds(
     effect: PhotometricEffect,
     each: ParallelMap,
 ) -> bool:
-    """Whether an effect beside those in gains at other times, unless it is known by frames, and on other sides."""
+    """Whether an added effect gains on held-out sides, and on held-out times unless an effect has values per frame."""
     effects = [*accepted, effect]
     for by_side in (False, True)[any(e.per_frame for e in effects) :]:
         held_out = judge(observations, nominal, effects, each, beside=accepted, by_side=by_side)
@@ -258,7 +260,7 @@ def _still_needed(
     accepted: list[PhotometricEffect],
     fitted: PhotometricFit,
 ) -> tuple[list[PhotometricEffect], PhotometricFit]:
-    """The causes without those that a later one made superfluous: free gains absorb any change of brightness."""
+    """Drop causes that the newest one makes superfluous: free gains absorb any change of brightness."""
     for effect in accepted[:-1]:
         if not LIGHT_LEVELS.significant(significance(fitted, effect.name, observations)[1]):
             accepted = [other for other in accepted if other is not effect]
@@ -280,22 +282,22 @@ def _finding(
 
 
 def values_of(effect: PhotometricEffect, profile: CameraProfile) -> dict[str, Any]:
-    """What a profile says of an effect, by the names of the table of effects."""
+    """An effect's values in a profile, named as in the table of effects."""
     return EFFECTS[effect.name].read(profile, profile)
 
 
 def frames_of(fitted: PhotometricFit) -> Sequence[int]:
-    """Movie indices of the frames whose gains were fitted; none without gains."""
+    """Movie indices of the frames whose gains were fitted; empty without gains."""
     return next((effect.frames for effect in fitted.effects if isinstance(effect, GainDrift)), ())
 
 
 def changes_of(
     before: dict[str, Any], now: dict[str, Any], std: Array, frames: Sequence[int] = ()
 ) -> dict[str, ParameterChange]:
-    """Values as they were and as they are, with their deviations; a gain starts from 1 in every frame.
+    """Values before and after, with standard deviations; a gain starts from 1 in every frame.
 
-    frames: movie indices that the deviations of a gain belong to; those of other frames, whose gain is taken from
-    their neighbours, are unknown (NaN).
+    frames: movie indices to which the deviations of a gain belong; those of other frames, which take the gain of their
+    neighbours, are unknown (NaN).
     """
     if "gain" in now:
         gain = now["gain"]
@@ -306,7 +308,7 @@ def changes_of(
 
 
 def sentence_of(name: str, changes: dict[str, ParameterChange]) -> str:
-    """What a cause means, for people."""
+    """What a cause means, for readers."""
     return SENTENCES[name].format(**{key: _shown(change.estimate) for key, change in changes.items()})
 
 
@@ -322,7 +324,7 @@ def judge_curve(
     pictures: Reader,
     each: ParallelMap = one_by_one,
 ) -> PictureVerdict:
-    """Gamma or black level from how blur mixes light, where nothing else determines them; needs correct blur paths."""
+    """Gamma or black level from how blur mixes light, where nothing else determines them; needs accurate blur paths."""
     verdict = PictureVerdict(profile)
     if observations is None or not light_varies(observations):
         usable = [frame for frame in frames if frame.exposure_s]
@@ -331,19 +333,19 @@ def judge_curve(
 
 
 def name_curve(verdict: PictureVerdict, evidence: MixingEvidence) -> None:
-    """Enter into the verdict what blur that mixes light says of its profile's curve."""
+    """Add to the verdict what light mixing by blur shows about its profile's curve."""
     tried = {name: _mixed(evidence, verdict.profile, name) for name in evidence.steps}
     found = verdict.mixed = {name: one for name, one in tried.items() if one}
     if not found:
         verdict.notes.append("no blurred frames beside sharp ones: the curve was not judged at constant exposure")
         return
     log.debug("mixing: %s", found)
-    sure = {name: one for name, one in found.items() if _is_sure(one, name, verdict.profile)}
-    if not sure:
+    supported = {name: one for name, one in found.items() if _is_supported(one, name, verdict.profile)}
+    if not supported:
         return
-    name = min(sure, key=lambda k: sure[k][1].after)
-    estimate, held = sure[name]
-    rivals = tuple(Rival(other, sure[other][1].after) for other in sure if other != name)
+    name = min(supported, key=lambda k: supported[k][1].after)
+    estimate, held = supported[name]
+    rivals = tuple(Rival(other, supported[other][1].after) for other in supported if other != name)
     ((parameter, before),) = values_of(CURVE[name], verdict.profile).items()
     changes = {parameter: ParameterChange(before, estimate.value, estimate.std)}
     verdict.findings.append(Finding(name, changes, held, rivals, estimate.p_value, sentence_of(name, changes)))
@@ -356,8 +358,8 @@ def _mixed(evidence: MixingEvidence, profile: CameraProfile, name: str) -> Mixed
     return (estimate, held) if estimate is not None and held is not None else None
 
 
-def _is_sure(found: Mixed, name: str, profile: CameraProfile) -> bool:
-    """Whether a change of the curve is significant, worth naming, and gains where it was not fitted."""
+def _is_supported(found: Mixed, name: str, profile: CameraProfile) -> bool:
+    """Whether a change of the curve is significant, large enough, and gains on held-out pairs."""
     estimate, held = found
     (now,) = values_of(CURVE[name], profile).values()
     size = estimate.value - now if name == "black_level" else abs(np.log(estimate.value / now))
@@ -376,9 +378,9 @@ def climb_blur(
     exposure_hypothesis: float | None,
     each: ParallelMap = one_by_one,
 ) -> tuple[PictureVerdict, bool]:
-    """Find a wrong exposure and defocus from local blur; also whether a time offset is really a wrong exposure.
+    """Find a wrong exposure and defocus from local blur, and whether a time offset is really a wrong exposure.
 
-    exposure_hypothesis: the exposure scale that would put an offset found at constant exposure down to the exposure.
+    exposure_hypothesis: the exposure scale that would explain an offset found at constant exposure.
     """
     verdict = PictureVerdict(profile)
     if not local_blur.frames_to_read(capture):
@@ -424,17 +426,17 @@ def climb_blur(
 
 
 def _is_named(name: str, change: float, std: float) -> bool:
-    """Whether a change that blur shows is significant, by the probability that is told, and large enough."""
+    """Whether a change found in blur is large enough, and significant by the reported p value."""
     return BLUR_LEVELS.matters(name, change) and BLUR_LEVELS.significant(_blur_p_value(name, change / std))
 
 
 def _blur_p_value(name: str, deviations: float) -> float:
-    """Of a value whose deviation comes from the scatter of a few blocks; defocus has no other side."""
+    """p value of a value whose deviation comes from the scatter of a few blocks; one-sided for defocus."""
     return (2 if name == "exposure_time" else 1) * student_tail(deviations, local_blur.BLOCKS - 1)
 
 
 def _exposure_holds(fitted: local_blur_fit.BlurFit, hypothesis: float | None) -> bool:
-    """Whether the blur wants another exposure, and the one that the points' offset asks for."""
+    """Whether the blur requires another exposure, and one that agrees with the points' time offset."""
     if hypothesis is None or not fitted.determined[0] or not 0.3 < hypothesis < 3.0:
         return False
     scale, std = float(fitted.values[0][0]), max(float(fitted.std[0]), 0.03)

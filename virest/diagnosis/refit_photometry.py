@@ -26,64 +26,64 @@ from virest.diagnosis.photometry_effects import BlackLevel, PhotometricEffect, R
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, pulls, significance
 from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, frames_of, light_varies, sentence_of, values_of
 
-STATED_DOUBT = np.array([0.15, 0.02])
-"""Standard deviation of a curve that a profile states: logarithm of gamma, black level."""
-UNKNOWN_DOUBT = np.array([0.3, 0.04])
-"""The same of the default for an unknown curve."""
+STATED_STD = np.array([0.15, 0.02])
+"""Prior standard deviation of a curve that a profile states: logarithm of gamma, black level."""
+UNKNOWN_STD = np.array([0.3, 0.04])
+"""The same for an unknown curve, for which the default is used."""
 _STEP = 1e-3
 _GAMMA, _BLACK = 0, 1
 
 
 @dataclass(frozen=True, slots=True)
 class CurveUncertainty:
-    """What is not known of values that brightness is read by."""
+    """Uncertainty of the curve and the exposure that brightness depends on."""
 
     spread: Array
     """(3, 3) second moments of true − profile: logarithm of gamma, black level, logarithm of the exposure scale."""
     rivals: tuple[ResponseCurve, ...] = ()
-    """Curves that explain the mixing as well."""
+    """Curves that explain the light mixing equally well."""
 
 
 def settle_light(
     light: PictureVerdict, curve: PictureVerdict, given: CameraProfile, causes: Sequence[Finding]
 ) -> tuple[PictureVerdict, CameraProfile]:
-    """Brightness's verdict, and the profile that curve ends with, with brightness's values fitted under that profile.
+    """Refit the photometric values under the final profile; returns (photometric verdict, profile).
 
-    light: the ladder's; curve: after what blur mixes.  given: what was known of the curve before.  causes: those of
-    points and blur.
+    light: verdict of the brightness ladder; curve: verdict after light mixing, with the final profile.  given: profile
+    with the prior knowledge of the curve.  causes: those of points and blur.
     """
     fitted, observations, profile = light.fitted, light.observations, curve.profile
     if fitted is None or observations is None or not fitted.effects:
         return light, profile
-    if not _seen_alike(observations, light.profile, profile):
+    if not _same_photometry(observations, light.profile, profile):
         fitted = fit_photometry(observations, profile, fitted.effects)
     prior = _prior(given)
     if light_varies(observations):
-        openness = CurveUncertainty(_curve_by_brightness(observations, fitted, prior))
+        uncertainty = CurveUncertainty(_curve_by_brightness(observations, fitted, prior))
     else:
-        openness = _curve_by_mixing(curve, prior)
-    openness.spread[2, 2] = _exposure_variance(causes)
-    doubtful = replace(fitted, covariance=fitted.covariance + _doubt(observations, fitted, openness))
-    findings = [_again(finding, fitted, doubtful, observations) for finding in light.findings]
+        uncertainty = _curve_by_mixing(curve, prior)
+    uncertainty.spread[2, 2] = _exposure_variance(causes)
+    widened = replace(fitted, covariance=fitted.covariance + _added_covariance(observations, fitted, uncertainty))
+    findings = [_refreshed(finding, fitted, widened, observations) for finding in light.findings]
     notes = [*light.notes, *_notes(light, curve)]
     found = replace(light, profile=fitted.profile, findings=findings, fitted=fitted, notes=notes)
     return found, fitted.profile
 
 
-def _seen_alike(observations: PhotometricObservations, one: CameraProfile, other: CameraProfile) -> bool:
-    """Whether two profiles read the same brightness by the same curve, times and exposures."""
+def _same_photometry(observations: PhotometricObservations, one: CameraProfile, other: CameraProfile) -> bool:
+    """Whether two profiles have the same curve, row times and exposures."""
     scales = one.shutter.exposure_scale, other.shutter.exposure_scale
     times = observations.row_time_s(one), observations.row_time_s(other)
     return one.response == other.response and scales[0] == scales[1] and np.allclose(*times, rtol=0, atol=1e-6)
 
 
-def _again(
-    finding: Finding, fitted: PhotometricFit, doubtful: PhotometricFit, observations: PhotometricObservations
+def _refreshed(
+    finding: Finding, fitted: PhotometricFit, widened: PhotometricFit, observations: PhotometricObservations
 ) -> Finding:
-    """A finding with its values now.  Whether there is an effect at all does not hang on the curve."""
+    """A finding with its refitted values; whether the effect exists does not depend on the curve's uncertainty."""
     effect = next(e for e in fitted.effects if e.name == finding.name)
     nominal = {name: change.nominal for name, change in finding.parameters.items()}
-    std = np.sqrt(np.diag(doubtful.of(effect.name)[1]))
+    std = np.sqrt(np.diag(widened.of(effect.name)[1]))
     changes = changes_of(nominal, values_of(effect, fitted.profile), std, frames_of(fitted))
     p_value = significance(fitted, effect.name, observations)[1]
     return replace(finding, parameters=changes, p_value=p_value, sentence=sentence_of(effect.name, changes))
@@ -99,30 +99,32 @@ def _notes(light: PictureVerdict, curve: PictureVerdict) -> list[str]:
     ]
 
 
-# ── what is open ───────────────────────────────────────────────────────────────────────────────────────────────────
+# ── uncertainty of curve and exposure ──────────────────────────────────────────────────────────────────────────────
 
 
 def _prior(given: CameraProfile) -> Array:
-    """How far the given curve may be off, (2,): as its estimates say, where they do."""
+    """Prior standard deviations (2,) of the given curve, from its estimates where it has them."""
     curve = given.response
     if curve is None:
-        return UNKNOWN_DOUBT
-    doubt = STATED_DOUBT.copy()
-    for place, name, value in ((_GAMMA, "gamma", curve.extra_gamma), (_BLACK, "black_level", curve.black_level)):
+        return UNKNOWN_STD
+    std = STATED_STD.copy()
+    for index, name, value in ((_GAMMA, "gamma", curve.extra_gamma), (_BLACK, "black_level", curve.black_level)):
         known = given.estimates.get(name)
         if known is None or not isinstance(known.std, int | float) or not isinstance(known.value, int | float):
             continue
         if np.isclose(known.value, value, atol=1e-3):
-            doubt[place] = max(known.std / (value if place == _GAMMA else 1.0), 1e-4)
-    return doubt
+            std[index] = max(known.std / (value if index == _GAMMA else 1.0), 1e-4)
+    return std
 
 
-def _doubt(observations: PhotometricObservations, fitted: PhotometricFit, openness: CurveUncertainty) -> Array:
-    """(k, k) to be added to the covariance; a rival is as likely as what was named."""
+def _added_covariance(
+    observations: PhotometricObservations, fitted: PhotometricFit, uncertainty: CurveUncertainty
+) -> Array:
+    """Covariance (k, k) to add; a rival curve is as likely as the reported one."""
     changed = [(_shifted(fitted.profile, change), _STEP) for change in _STEP * np.eye(3)]
     pull = pulls(observations, fitted.profile, fitted, changed)
-    added = pull @ openness.spread @ pull.T
-    for curve in openness.rivals:
+    added = pull @ uncertainty.spread @ pull.T
+    for curve in uncertainty.rivals:
         away = fit_photometry(observations, replace(fitted.profile, response=curve), fitted.effects)
         off = away.values - fitted.values
         added += 0.5 * np.outer(off, off)
@@ -139,7 +141,7 @@ def _shifted(profile: CameraProfile, change: Array) -> CameraProfile:
 
 
 def _exposure_variance(causes: Sequence[Finding]) -> float:
-    """Of the logarithm of the exposure's scale, where that was found."""
+    """Variance of the log exposure scale if that is among the causes; otherwise 0."""
     for finding in causes:
         if finding.name == "exposure_time":
             change = finding.parameters["exposure_scale"]
@@ -148,30 +150,30 @@ def _exposure_variance(causes: Sequence[Finding]) -> float:
 
 
 def _curve_by_brightness(observations: PhotometricObservations, fitted: PhotometricFit, prior: Array) -> Array:
-    """Spread (3, 3) of what the ladder did not name of the curve, from a fit of it beside the rest."""
+    """Second moments (3, 3) of the curve changes that the ladder did not report, from a joint fit with the rest."""
     names = [effect.name for effect in fitted.effects]
     curves: tuple[PhotometricEffect, ...] = (ResponseGamma(), BlackLevel())
-    places = [k for k, effect in enumerate(curves) if effect.name not in names]
+    free = [k for k, effect in enumerate(curves) if effect.name not in names]
     spread = np.zeros((3, 3))
-    if not places:
+    if not free:
         return spread
-    beside = fit_photometry(observations, fitted.profile, [*fitted.effects, *(curves[k] for k in places)])
+    beside = fit_photometry(observations, fitted.profile, [*fitted.effects, *(curves[k] for k in free)])
     now = fitted.profile.response or ResponseCurve("srgb")
     inner = slice(len(fitted.values), None)
     estimate, covariance = beside.values[inner].copy(), beside.covariance[inner, inner].copy()
-    if _GAMMA in places:
+    if _GAMMA in free:
         slope = 1 / max(float(estimate[0]), 0.1)
         covariance[0] *= slope
         covariance[:, 0] *= slope
         estimate[0] = np.log(max(float(estimate[0]), 0.1) / now.extra_gamma)
-    if _BLACK in places:
+    if _BLACK in free:
         estimate[-1] -= now.black_level
-    spread[np.ix_(places, places)] = _second_moment(estimate, covariance, prior[places])
+    spread[np.ix_(free, free)] = _second_moment(estimate, covariance, prior[free])
     return spread
 
 
 def _curve_by_mixing(curve: PictureVerdict, prior: Array) -> CurveUncertainty:
-    """What blur leaves open: the deviation of what it named, or of a gamma that it did not name."""
+    """Uncertainty after light mixing: of the reported change, else of an unreported gamma, else the prior's."""
     spread = np.zeros((3, 3))
     now = curve.profile.response or ResponseCurve("srgb")
     named = {finding.name: finding for finding in curve.findings}
@@ -192,7 +194,7 @@ def _curve_by_mixing(curve: PictureVerdict, prior: Array) -> CurveUncertainty:
 
 
 def _rival(named: Finding, rival: str, curve: PictureVerdict) -> ResponseCurve:
-    """The curve without the change that was named and with its rival's."""
+    """The curve with its rival's change instead of the reported one."""
     fields = {"response_curve": "extra_gamma", "black_level": "black_level"}
     (change,) = named.parameters.values()
     now = curve.profile.response or ResponseCurve("srgb")
@@ -200,7 +202,7 @@ def _rival(named: Finding, rival: str, curve: PictureVerdict) -> ResponseCurve:
 
 
 def _second_moment(estimate: Array, covariance: Array, prior: Array) -> Array:
-    """E[c cᵀ] of a change c that was measured, and that is 0 give or take prior to begin with."""
+    """E[c cᵀ] of a measured change c, with a prior of mean 0 and standard deviation ``prior``."""
     precision = np.linalg.inv(covariance)
     posterior = np.linalg.inv(precision + np.diag(1 / prior**2))
     mean = posterior @ precision @ estimate

@@ -1,4 +1,4 @@
-"""What is left once every cause is in: structure along row, time, radius, rate, brightness or place, or noise."""
+"""Residuals after all causes: structure along row, time, radius, rate, brightness or position, and excess noise."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
-"""Structure of this size, and of this part of the noise, has a cause."""
+"""Structure above this size, and above this fraction of the noise, has a cause."""
 STRUCTURE_P = 1e-4
 TRACKING_BIAS_PX = 0.02
 SCALE_EXCESS = 1.25
-"""Differences this many times their noise, measured without the model, and STRUCTURE_PX beyond it are not all noise."""
+"""Residuals above this many times their noise, measured without the model, and STRUCTURE_PX beyond it are not all
+noise."""
 LEAST_IN_PAIR = 8
 STRAY_DISTANCE = 6.0
-CALM = 40.0
-"""Brightness this many typical deviations off counts half: a band of the sensor is evidence, a passer-by is not."""
+HALF_WEIGHT_SIGMA = 40.0
+"""Brightness residual with half weight, in robust σ: a band of the sensor is evidence, a passer-by is not."""
 PHOTOMETRIC_STRUCTURE = 1.5
-"""Grey levels."""
+"""Minimum size of a structure, grey levels."""
 
 
 def remaining_structure(geometric: GeometricVerdict, photometric: picture_ladder.PictureVerdict) -> Remaining:
-    """The strongest structure, in the points first, then in brightness."""
+    """The strongest structure: in the points if significant there, otherwise in brightness if significant there."""
     geometric_left = points_left(geometric)
     if geometric_left.significant or photometric.observations is None:
         return geometric_left
@@ -43,10 +44,10 @@ def remaining_structure(geometric: GeometricVerdict, photometric: picture_ladder
 
 
 def points_left(geometric: GeometricVerdict) -> Remaining:
-    """Structure and noise beyond tracking's in the points of the final model.
+    """Structure, and noise in excess of the tracker's, in the points under the final model.
 
-    What stands before or behind the scene's plane moves points along the parallax: as far as their spread of depths
-    explains that, it is the scene's and no fault of the model.
+    Objects in front of or behind the scene's plane move points along the parallax; as far as their spread of depths
+    explains this, it belongs to the scene and is not an error of the model.
     """
     fitted, table = geometric.fit, geometric.table
     profile, lens = fitted.profile, fitted.profile.intrinsics
@@ -69,12 +70,12 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
     found.append(_along_time(left_px, fitted.weight, table.pair))
     strongest = max(found, key=lambda s: s.size)
-    stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.astray)
+    stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.independent_share)
     limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
     beyond = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
     p_noisier, p_stray = _more_than_noise(fitted.distance, table.pair, noise / geometric.step_noise_px)
     noisier = beyond > STRUCTURE_PX and geometric.final_rms_px > SCALE_EXCESS * noise and p_noisier < STRUCTURE_P
-    strays = geometric.astray > STRAY_PART or (stray > STRAY_PART and p_stray < STRUCTURE_P)
+    strays = geometric.independent_share > STRAY_PART or (stray > STRAY_PART and p_stray < STRUCTURE_P)
     log.debug("left: %s, limit %.3f, beyond noise %.3f, stray %.3f", found, limit, beyond, stray)
     if strongest.size > limit and strongest.p_value < STRUCTURE_P:
         sentence = f"residual {strongest.size:.3f} px, strongest along {strongest.along}"
@@ -84,16 +85,16 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
         return Remaining(p_noisier, strongest.along, beyond, GEOMETRY, True, sentence)
     if strays:
         sentence = f"{stray:.0%} of the points move on their own"
-        p_value = None if geometric.astray > STRAY_PART else p_stray
+        p_value = None if geometric.independent_share > STRAY_PART else p_stray
         return Remaining(p_value, "place", strongest.size, GEOMETRY, True, sentence)
     return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, False)
 
 
 def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> tuple[float, float]:
-    """Probabilities that pairs' whitened distances are noise alone, and that as many points stray by chance.
+    """p values of the hypotheses that whitened distances are noise alone, and that the stray points are chance.
 
-    One-sided t tests over the pairs: of their capped mean squares against 2 noise² (SCALE_EXCESS allowed for), and of
-    their parts of strays against STRAY_PART.
+    One-sided t tests over the pairs: of their capped mean squares against 2 (SCALE_EXCESS noise)², and of their stray
+    fractions against STRAY_PART.
     """
     count = np.maximum(np.bincount(pair), 1)
     used = np.bincount(pair) > LEAST_IN_PAIR
@@ -105,7 +106,7 @@ def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> t
 
 
 def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Structure:
-    """Between the pairs: how much more their mean differences scatter than their points do."""
+    """Structure over time: scatter of the pairs' mean residuals in excess of what the scatter of their points gives."""
     total = np.maximum(np.bincount(pair, weight), 1e-9)
     excess, chi2, freedom = 0.0, 0.0, 0
     for column in difference.T:
@@ -128,7 +129,7 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
         for name, values in observations.covariates(photometric.profile).items()
         if name in ("row", "radius", "brightness", "row_fraction", "x_px", "y_px")
     }
-    weight = cauchy_weight(left**2, CALM * max(robust_std(left), 1.0))
+    weight = cauchy_weight(left**2, HALF_WEIGHT_SIGMA * max(robust_std(left), 1.0))
     found = structures(left[:, None], weight, covariates, observations.frame.astype(np.intp), 0.5)
     strongest = max(found, key=lambda s: s.size)
     log.debug("light left: %s", found)
@@ -138,7 +139,7 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
 
 
 def residuals(geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:
-    """Differences (px) and what they may run along."""
+    """Point residuals (px) with their covariates, before or after the causes, for figures."""
     fitted = geometric.nominal_fit if nominal else geometric.fit
     table = geometric.nominal_table if nominal else geometric.table
     profile, lens = fitted.profile, fitted.profile.intrinsics

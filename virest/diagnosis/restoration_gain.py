@@ -1,18 +1,19 @@
-"""What a better model does for the restored pictures, measured without truth.
+"""Effect of a better model on the restored frames, measured without ground truth.
 
-Some pairs of neighbouring frames, high-motion ones spread over the capture, are kept back from every fit of points,
-blur and curve, and restored with the profile as given and with the extended one.  (Brightness sees them: a gain that
-drifts belongs to its frame, and other frames do not tell it.)  Two neighbours are two independent witnesses of one
-scene:
+Some pairs of neighbouring frames, with high motion and spread over the capture, are kept back from every fit of points,
+blur and curve, and restored with the given profile and with the extended one.  (Brightness fits use them: a drifting
+gain belongs to its frame and cannot be inferred from other frames.)  Two neighbours are two independent observations of
+one scene:
 
-- *sharpness*: the gradient that both show.  One picture is laid on the other by a homography through tracked points,
-  and the product of their gradients is averaged: noise and the ringing of a wrong kernel differ between the two and
-  cancel, the scene's own detail stays.  Neighbours move alike, though, and so do their wrong kernels: the mean product
-  is weighted by its part of the two pictures' own gradient energies, which ringing lowers.  No model of the camera
-  enters, and none is favoured.
-- *disagreement*: the model says where a point of one restored picture lies in the other, from the gyroscope alone (and
-  the translation, where it is known); the distance to where it is found is what geometry, clocks and rows get wrong.
-- *brightness*: the light along the same points, which flicker left in one picture and not in the other changes.
+- *sharpness*: the gradient that both share.  One picture is aligned to the other by a homography through tracked
+  points, and the product of their gradients is averaged: noise and the ringing of a wrong kernel differ between the two
+  and cancel, while scene detail stays.  However, neighbours move alike, and so their wrong kernels are alike: the mean
+  product is weighted by its fraction of the two pictures' own gradient energies, which ringing lowers.  No camera model
+  is used, so none is favoured.
+- *disagreement*: the model predicts where a point of one restored picture lies in the other, from the gyroscope alone
+  (and the translation, where it is known); the distance to the tracked position is the error of geometry, clocks and
+  rows.
+- *brightness*: the light at the same points, which differs where flicker is left in one picture and not in the other.
 """
 
 from __future__ import annotations
@@ -52,15 +53,15 @@ Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
 PAIRS = 4
 KEPT_BACK = 0.1
-"""At most this part of the frames is kept back from fits."""
+"""Maximum fraction of the frames that is kept back from fits."""
 MIN_TRACKS = 16
-"""Fewer points than this lay no picture on another."""
+"""Minimum number of points for aligning two pictures."""
 HOMOGRAPHY_PX = 2.0
 EDGE_PX = 4
-"""Left out along the border of what is real: half the gradient's and the interpolation's reach."""
+"""Margin excluded along the border of the valid area: half the reach of the gradient and of the interpolation."""
 PATCH_PX = 9
 LIGHT_RANGE = (0.02, 0.9)
-"""Of the curve's whole range; darker is noise, brighter may be clipped."""
+"""As fractions of the curve's full range; darker light is noise, brighter light may be clipped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,15 +69,15 @@ class RestorationGain:
     """``before`` with the profile as given, ``after`` with the extended one; NaN where it could not be measured."""
 
     sharpness_recorded: float
-    """Grey levels per pixel: root of the gradient energy that neighbours share, of the pictures as recorded."""
+    """Root of the gradient energy that neighbours share, grey levels per pixel, in the recorded pictures."""
     sharpness_before: float
-    """The same, restored; all three over the area that is real in both restorations."""
+    """The same in the restored pictures; all three over the area that is valid in both restorations."""
     sharpness_after: float
     disagreement_before_px: float
-    """Median distance between where the model puts points of a restored neighbour and where they are found."""
+    """Median distance between predicted and tracked positions of points in the restored neighbour."""
     disagreement_after_px: float
     brightness_disagreement_before: float
-    """Spread of the light's ratio along those points about the pair's own (robust standard deviation, relative)."""
+    """Robust standard deviation, relative, of the light ratio at those points about the median of the pair."""
     brightness_disagreement_after: float
     frames: tuple[int, ...]
     """Movie indices of the frames that were restored."""
@@ -93,7 +94,7 @@ class _Pair:
 
 @dataclass(frozen=True, slots=True)
 class PairsRestored:
-    """What one profile makes of the frames, and what it says of their poses."""
+    """Frames restored with one profile, and their poses under it."""
 
     plan: RestorationPlan
     frames: dict[int, Frame]
@@ -101,23 +102,23 @@ class PairsRestored:
     trajectory: Trajectory | None
     lens: MovingLens | None
     guide: GyroGuide | None
-    """Of the recorded frames, where the pictures follow the gyroscope."""
+    """Tracking guide of the recorded frames; None if they do not follow the gyroscope."""
 
     def pair(self, first: int) -> _Pair | None:
-        """Frames ``first`` and the next; None where one of them could not be restored."""
+        """Frames ``first`` and ``first + 1``; None if one of them could not be restored."""
         a, b = (self.restored.get(first + step) for step in (0, 1))
         if a is None or b is None or a.picture is None or b.picture is None:
             return None
         return _tracked(first, (a.picture, b.picture), (a.valid_px, b.valid_px), self)
 
     def seen_before(self, first: int, second: int, shape: tuple[int, int], factor: int) -> MapBetween | None:
-        """As a guide through restored frames, where the gyroscope is one through the recorded."""
+        """As a tracking guide for restored frames; None if the gyroscope does not guide the recorded ones."""
         if self.guide is None:
             return None
         return map_between(lambda points_px: self.predicted(points_px, second, first), shape, factor)
 
     def predicted(self, points_px: Array, frame: int, other: int) -> Array:
-        """Where points (n, 2) of one restored frame lie in another one, by the model."""
+        """Positions (n, 2) in another restored frame of the points (n, 2) of one, by the model."""
         assert self.trajectory is not None
         assert self.lens is not None
         here, there = (self._motion(number) for number in (frame, other))
@@ -145,8 +146,8 @@ def measure_restoration_gain(
 ) -> RestorationGain:
     """Restore a few pairs of neighbours with both profiles and compare; pictures: RGB by index, gray: luma.
 
-    firsts: the first frame of each pair, kept back from the fits that made the extended profile; None: any.
-    before: what :func:`restore_pairs` makes of them with the nominal profile, where that is done already.
+    firsts: the first frame of each pair, kept back from the fits behind the extended profile; None: any.
+    before: the result of :func:`restore_pairs` with the nominal profile, if already computed.
     """
     firsts = chosen_pairs(capture, extended) if firsts is None else firsts
     numbers = _frames_of(firsts)
@@ -192,13 +193,13 @@ def restore_pairs(
     gray: Reader,
     settings: RestorationSettings = PRESETS["balanced"],
 ) -> PairsRestored:
-    """What one profile makes of pairs of neighbours: all of it in one call, for another process perhaps."""
+    """Restore pairs of neighbours with one profile in a single call, for example in another process."""
     recorded = {index: picture for index, picture in pictures(_frames_of(firsts)) if picture is not None}
     return _restored(capture, [profile], recorded, gray, settings, one_by_one)[0]
 
 
 def chosen_pairs(capture: Capture, profile: CameraProfile) -> list[int]:
-    """First frames of lively pairs spread over the capture; one of the start-up where the profile knows its lag."""
+    """First frames of high-motion pairs over the capture, and of one in the start-up if the profile has a lag."""
     frames = at_true_times(capture.frames, profile, capture.repeats)
     offset_s = profile.time_offset_s or 0.0
     chosen = choose_pairs(frames, capture.imu, 2 * PAIRS, 2, offset_s)
@@ -209,9 +210,9 @@ def chosen_pairs(capture: Capture, profile: CameraProfile) -> list[int]:
 
 
 def pairs_to_keep_back(capture: Capture, profile: CameraProfile) -> list[int]:
-    """First frames of the pairs that no fit is to see, spread over the capture; of the start-up too, if there is one.
+    """First frames of the pairs to exclude from all fits, spread over the capture, including the start-up.
 
-    None where the capture is so short that a pair is more than KEPT_BACK of it.
+    Empty if one pair is more than KEPT_BACK of the capture.
     """
     frames = [
         dataclasses.replace(frame, skip_reason=None, skip_codes=()) if frame.only_startup else frame
@@ -224,7 +225,7 @@ def pairs_to_keep_back(capture: Capture, profile: CameraProfile) -> list[int]:
 
 
 def _pairs_of(chosen: Sequence[int], capture: Capture) -> list[int]:
-    """First frames of the pairs of neighbours among some frames, without exact repeats; no two pairs share a frame."""
+    """First frames of pairs of neighbours among some frames, without exact repeats; no two pairs share a frame."""
     firsts: list[int] = []
     for index in sorted(set(chosen)):
         free = not firsts or index > firsts[-1] + 1
@@ -238,27 +239,27 @@ def shared_gradient(
 ) -> float:
     """Gradient energy that two pictures of one scene share, (grey levels per pixel)²; NaN without a common area.
 
-    ⟨∇a·∇b⟩² / √(⟨|∇a|²⟩⟨|∇b|²⟩), not below 0, with b laid on a by a homography through the tracks.
+    ⟨∇a·∇b⟩² / √(⟨|∇a|²⟩⟨|∇b|²⟩), not below 0, with b aligned to a by a homography through the tracks.
     """
-    place = _homography(tracks)
-    if place is None:
+    homography = _homography(tracks)
+    if homography is None:
         return np.nan
     first, second = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in pictures)
     size = first.shape[1], first.shape[0]
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    laid = cv2.warpPerspective(second, place, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    real = [_inside(rectangle, first.shape) for rectangle in valid_px]
-    there = cv2.warpPerspective(real[1], place, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
-    common = cv2.erode(real[0] & there, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8), borderValue=0) > 0
+    aligned = cv2.warpPerspective(second, homography, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    valid = [_inside(rectangle, first.shape) for rectangle in valid_px]
+    there = cv2.warpPerspective(valid[1], homography, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+    common = cv2.erode(valid[0] & there, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8), borderValue=0) > 0
     if not common.any():
         return np.nan
-    a, b = (np.stack([_slope(p, 1, 0)[common], _slope(p, 0, 1)[common]]) for p in (first, laid))
+    a, b = (np.stack([_slope(p, 1, 0)[common], _slope(p, 0, 1)[common]]) for p in (first, aligned))
     product, own = float(np.vdot(a, b)), float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
     return max(product, 0.0) ** 2 / max(own, 1e-9) / int(common.sum())
 
 
 def _frames_of(firsts: Sequence[int]) -> list[int]:
-    """Both frames of each pair, rising."""
+    """Both frames of each pair, ascending."""
     return sorted({first + step for first in firsts for step in (0, 1)})
 
 
@@ -273,7 +274,7 @@ def _restored(
     settings: RestorationSettings,
     each: ParallelMap,
 ) -> list[PairsRestored]:
-    """What each profile makes of the recorded frames."""
+    """The recorded frames restored with each profile."""
     planned = [_planned(capture, profile, gray, settings) for profile in profiles]
     asked = [
         (dataclasses.replace(one.frames[n], skip_reason=None, skip_codes=()), recorded[n], one.plan)
@@ -293,7 +294,7 @@ def _restored_one(frame: Frame, picture: Picture, imu: ImuSamples, plan: Restora
 
 
 def _planned(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> PairsRestored:
-    """What a profile says of the frames, nothing restored yet."""
+    """Plan and poses of the frames under a profile, with nothing restored yet."""
     plan = _plan(capture, profile, gray, settings)
     frames = {frame.index: frame for frame in at_true_times(capture.frames, plan.profile, capture.repeats)}
     known = plan.profile.intrinsics is not None
@@ -304,7 +305,7 @@ def _planned(capture: Capture, profile: CameraProfile, gray: Reader, settings: R
 
 
 def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> RestorationPlan:
-    """As `process` plans it; a scene at infinity has no translation to be estimated."""
+    """The plan that `process` would use; a scene at infinity needs no estimate of translation."""
     if profile.depth_m is not None and np.isinf(profile.depth_m) and profile.intrinsics is not None:
         return RestorationPlan(profile, settings, imu_gaps_s=capture.imu_gaps_s)
 
@@ -338,7 +339,7 @@ def _within(points_px: Array, rectangle: Rectangle) -> NDArray[np.bool_]:
 
 
 def _shared(pairs: list[tuple[Rectangle, Rectangle]]) -> tuple[Rectangle, Rectangle]:
-    """Of the first and of the second pictures, the area that is real in every restoration."""
+    """(area of the first pictures, area of the second pictures) that is valid in every restoration."""
     first, second = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
     return _overlap(first), _overlap(second)
 
@@ -357,27 +358,27 @@ def _inside(rectangle: Rectangle, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 
 def _homography(tracks: TrackPair | None) -> Array | None:
-    """First to second picture; None where the points do not determine it."""
+    """Homography from first to second picture; None if the points do not determine it."""
     if tracks is None or len(tracks) < MIN_TRACKS:
         return None
-    place, used = cv2.findHomography(tracks.points_first_px, tracks.points_second_px, cv2.RANSAC, HOMOGRAPHY_PX)
-    return None if place is None or int(used.sum()) < MIN_TRACKS // 2 else np.asarray(place, float)
+    homography, used = cv2.findHomography(tracks.points_first_px, tracks.points_second_px, cv2.RANSAC, HOMOGRAPHY_PX)
+    return None if homography is None or int(used.sum()) < MIN_TRACKS // 2 else np.asarray(homography, float)
 
 
 def _slope(picture: NDArray[np.float32], across: int, down: int) -> NDArray[np.float32]:
-    """Sobel's derivative, grey levels per pixel."""
+    """Sobel derivative, grey levels per pixel."""
     return np.asarray(cv2.Sobel(picture, cv2.CV_32F, across, down, ksize=3, scale=1 / 8))
 
 
 def _distances(restoration: PairsRestored, pair: _Pair, first: int) -> Array:
     if restoration.lens is None or pair.tracks is None:
         return np.empty(0)
-    put = restoration.predicted(pair.tracks.points_first_px, first, first + 1)
-    return np.asarray(np.linalg.norm(pair.tracks.points_second_px - put, axis=1))
+    predicted_px = restoration.predicted(pair.tracks.points_first_px, first, first + 1)
+    return np.asarray(np.linalg.norm(pair.tracks.points_second_px - predicted_px, axis=1))
 
 
 def _light_ratios(profile: CameraProfile, pair: _Pair) -> Array:
-    """Log of the ratio of light at tracked points, less the pair's median: exposure may change between frames."""
+    """Log ratio of the light at tracked points minus the pair's median, since exposure may change between frames."""
     if pair.tracks is None:
         return np.empty(0)
     curve = profile.response or ResponseCurve("srgb")

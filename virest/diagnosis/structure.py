@@ -1,7 +1,7 @@
-"""What is left when no named cause gains any more, and whether it runs along anything.
+"""Test whether residuals have structure along a covariate once no named cause gains any more.
 
-Residuals are averaged in bins of each covariate.  A mean that the scatter between stretches of time does not explain is
-structure: the model is wrong in a way that has no name here.
+Residuals are averaged in bins of each covariate.  A mean that the scatter between time blocks does not explain is
+structure: the model is wrong in a way that no cause names.
 """
 
 from __future__ import annotations
@@ -16,33 +16,34 @@ from virest.inference.chance import chi2_tail, normal_deviate, student_tail
 Array = NDArray[np.float64]
 BINS = 10
 LEAST_IN_CELL = 4
-"""Residuals of one bin in one stretch of time; fewer tell no mean."""
+"""Minimum number of residuals for a mean of one bin in one time block."""
 
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """What the residuals do along one covariate."""
+    """Structure of the residuals along one covariate."""
 
     along: str
     size: float
-    """rms of the bins' means beyond what scatter makes, in the residuals' unit."""
+    """Rms of the bin means in excess of their scatter, in the residuals' unit."""
     p_value: float
-    """Of no structure, scatter between stretches of time taken as it is."""
+    """For the hypothesis of no structure, given the scatter between time blocks."""
 
 
 def structures(
-    values: Array, weight: Array, covariates: dict[str, Array], stretch: NDArray[np.intp], floor: float
+    values: Array, weight: Array, covariates: dict[str, Array], block: NDArray[np.intp], floor: float
 ) -> list[Structure]:
-    """Test each covariate (n,); values (n, k) residuals, weight (n,), stretch (n,) number of the stretch of time.
+    """Test each covariate (n,); strongest structure first.
 
-    floor: means this small, in the residuals' unit, are tracking's or the codec's own bias.
+    values: (n, k) residuals; weight: (n,); block: (n,) number of the time block.  floor: means this small, in the
+    residuals' unit, are bias of the tracker or the codec.
     """
-    found = [_along(name, values, weight, c, stretch, floor) for name, c in covariates.items()]
+    found = [_along(name, values, weight, c, block, floor) for name, c in covariates.items()]
     return sorted(found, key=lambda s: -s.size)
 
 
 def _along(
-    name: str, values: Array, weight: Array, covariate: Array, stretch: NDArray[np.intp], floor: float
+    name: str, values: Array, weight: Array, covariate: Array, block: NDArray[np.intp], floor: float
 ) -> Structure:
     edges = np.unique(np.quantile(covariate, np.linspace(0, 1, BINS + 1)[1:-1]))
     number = np.searchsorted(edges, covariate, side="right")
@@ -51,7 +52,7 @@ def _along(
     for b in range(len(edges) + 1):
         inside = number == b
         for column in values.T:
-            mean, error, count = _mean_of_stretches(column[inside], weight[inside], stretch[inside], by_time)
+            mean, error, count = _mean_of_blocks(column[inside], weight[inside], block[inside], by_time)
             if count < 2:
                 continue
             spread = error**2 + floor**2
@@ -64,16 +65,17 @@ def _along(
     return Structure(name, float(np.sqrt(excess / bins)), chi2_tail(chi2, freedom))
 
 
-def _mean_of_stretches(
-    values: Array, weight: Array, stretch: NDArray[np.intp], by_time: bool
-) -> tuple[float, float, int]:
-    """Weighted mean, its standard error from the scatter between stretches, and how many there were."""
+def _mean_of_blocks(values: Array, weight: Array, block: NDArray[np.intp], by_time: bool) -> tuple[float, float, int]:
+    """(weighted mean, its standard error from the scatter between blocks, number of blocks).
+
+    by_time: the scatter is that of the values, whose number is returned.
+    """
     if not len(values):
         return 0.0, 0.0, 0
-    count = np.bincount(stretch)
-    total = np.bincount(stretch, weight)
+    count = np.bincount(block)
+    total = np.bincount(block, weight)
     usable = (count >= LEAST_IN_CELL) & (total > 0)
-    means = np.bincount(stretch, weight * values)[usable] / total[usable]
+    means = np.bincount(block, weight * values)[usable] / total[usable]
     if by_time:
         scatter = values - np.average(values, weights=weight)
         error = np.sqrt(np.sum((weight * scatter) ** 2)) / weight.sum()

@@ -1,4 +1,4 @@
-"""Tracked points of a capture and the terms that its profile leaves open: where the geometric ladder begins."""
+"""Tracked points of a capture and the terms that its profile leaves open: the start of the geometric ladder."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from virest.motion.integration import integrate_gyro
 
 Array = NDArray[np.float64]
 WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240
-"""Captures of up to 15 s at 30 frames a second are tracked in every frame; longer ones in runs of frames, of this
-total length."""
+"""Captures of up to the first number of frames (15 s at 30 frames per second) are tracked in every frame; longer ones
+in runs of frames whose total length is the second number."""
 MIN_PAIRS = 6
 MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
 AXIS_EXPLAINED = 0.6
-"""Least squared correlation between the rotations of pictures and gyroscope about one axis."""
+"""Minimum squared correlation between the rotations of frames and gyroscope about one axis."""
 WELL_EXPLAINED = 0.98
-"""Rotations that agree this well leave no distant clock rate to search for."""
+"""If the rotations agree better than this, no distant clock rate is searched for."""
 STRAY_PART = 0.1
-"""A larger share of independently moving points is not chance."""
-TOGETHER = 0.3
-"""Least intraclass correlation of points that move together."""
+"""A larger fraction of independently moving points is not chance."""
+MIN_COMMON_MOTION = 0.3
+"""Minimum intraclass correlation of points that move together."""
 NEIGHBOURHOOD = np.add.outer(np.arange(CELLS) // 2 * CELLS, np.arange(CELLS) // 2).ravel()
 """Index of the block of two by two cells that each cell belongs to."""
 
@@ -74,7 +74,7 @@ class TrackedPoints:
     each: ParallelMap = one_by_one
 
     def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
-        """The ladder's end; climbed again without image regions that move independently, where there are any."""
+        """Climb the ladder, and climb it again without image regions that move independently, if there are any."""
         found = self._climbed(self.observed, progress)
         if not self.rungs_allowed:
             return found
@@ -83,16 +83,19 @@ class TrackedPoints:
         independent, share = cells[cell], float(cells[cell].mean())
         neighbourhood = len(cells) * found.table.pair + NEIGHBOURHOOD[cell]
         weighted_px = found.fit.difference_px * found.fit.weight[:, None]
-        if share < STRAY_PART or _shared_part(weighted_px[independent], neighbourhood[independent]) < TOGETHER:
+        if (
+            share < STRAY_PART
+            or _common_motion(weighted_px[independent], neighbourhood[independent]) < MIN_COMMON_MOTION
+        ):
             return found
         rest = self.observed.without_cells(cells)
         again = self._climbed(replace(rest, noise_px=step_noise_px(rest.pairs)), progress)
-        again.astray = share
+        again.independent_share = share
         again.notes.append(f"{share:.0%} of the points lie in image regions that move independently and were excluded")
         return again
 
     def described(self, found: GeometricVerdict, lit: CameraProfile) -> GeometricVerdict:
-        """A ladder's end with the fields that its residuals require, under the lighting found by the photometric stage.
+        """Add the fields that a verdict's residuals require under the lighting found by the photometric stage.
 
         Flicker shifts the mean time of each row's light, which looks like an uneven readout.
         """
@@ -118,8 +121,8 @@ class TrackedPoints:
         return found
 
 
-def _shared_part(difference_px: Array, group: NDArray[np.intp]) -> float:
-    """Intraclass correlation of residuals (n, 2) within groups: neighbours in one pair of frames.
+def _common_motion(difference_px: Array, group: NDArray[np.intp]) -> float:
+    """Intraclass correlation of residuals (n, 2) within groups, here neighbours in one pair of frames.
 
     Badly tracked neighbours share nothing; points on one moving object share its motion.
     """
@@ -145,7 +148,7 @@ def at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]
 
 
 def lighting_changes(profile: CameraProfile) -> bool:
-    """Whether the lighting changes between frames, which biases tracked points."""
+    """Whether the light changes between frames, which biases tracked points."""
     return bool(profile.extensions.flicker_amplitude or profile.extensions.gain)
 
 
@@ -169,7 +172,7 @@ def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: Cam
     along = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     rows_px = along[:1] if shutter.reads_columns else along[:, :1]
 
-    def even(wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    def corrected(wanted: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
         for index, picture in gray(wanted):
             frame = by_index.get(index)
             if picture is None or frame is None:
@@ -182,7 +185,7 @@ def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: Cam
             linear = curve.linear_table()[picture] / (light * gain)
             yield index, np.clip(np.rint(255 * curve.encode(linear)), 0, 255).astype(np.uint8)
 
-    return even
+    return corrected
 
 
 # ── values that the profile leaves open ──────────────────────────────────────────────────────────────────────────
@@ -191,9 +194,10 @@ def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: Cam
 def with_null_values(
     observed: ObservedTracks, capture: Capture, profile: CameraProfile
 ) -> tuple[CameraProfile, list[Term], list[str], FarStart, bool]:
-    """(profile with initial guesses, terms to fit on every rung, notes, distant starts of the clocks, agreement).
+    """(profile with initial guesses, terms to fit on every rung, notes, far starts of clocks and axes, agreement).
 
-    Agreement: whether the rotations of pictures and gyroscope agree at some offset, as far as the camera rotates.
+    Agreement: whether the rotations of frames and gyroscope agree at some offset or about some axis, or are too small
+    to be compared.
     """
     terms: list[Term] = []
     notes: list[str] = []
@@ -221,14 +225,14 @@ def with_null_values(
 
 
 def at_rest(observed: ObservedTracks, profile: CameraProfile) -> bool:
-    """Whether neither rotations nor points exceed a tracker's error from frame to frame: nothing is determined."""
+    """Whether neither rotations nor points move by more than a tracker's error per frame: nothing is determined."""
     steps = (np.linalg.norm(pair.points_second_px - pair.points_first_px, axis=-1) for pair in observed.pairs)
     moved_px = np.median(np.concatenate([np.zeros(1), *steps]))
     return bool(moved_px < MIN_MOTION_PX) and _hardly_turns(observed, profile)
 
 
 def _hardly_turns(observed: ObservedTracks, profile: CameraProfile) -> bool:
-    """Whether the pictures' rotations are too small for a comparison with the gyroscope."""
+    """Whether the frame rotations are too small to be compared with the gyroscope's."""
     if len(observed.pairs) < MIN_PAIRS:
         return True
     turns = observed.turns(profile)
@@ -254,7 +258,7 @@ def _one_axis_agrees(observed: ObservedTracks, capture: Capture, profile: Camera
 
 
 def _agree_at(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> FarStart | None:
-    """Changes of the profile's clocks and axes at which the rotations agree best; None where they agree nowhere."""
+    """Changes of the profile's clocks and axes at which the rotations agree best; None if they agree nowhere."""
     if len(observed.pairs) < MIN_PAIRS:
         return None
     turns, given_s = observed.turns(profile), profile.time_offset_s or 0.0

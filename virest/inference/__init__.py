@@ -1,1 +1,1 @@
-"""What frames and inertial samples tell together: tracked points, clocks, robust fits with their deviations."""
+"""Estimation from frames and inertial samples together: tracked points, clocks, robust fits and their covariances."""

@@ -41,7 +41,7 @@ class Window:
     residual: float
     """Robust standard deviation of the residual, in units of the tracking noise."""
     reason: str
-    """Why the window's velocity is not known in metres; empty: it is."""
+    """Why the window's velocity is not known in metres; empty if it is."""
     spread: float = 0.0
     """Standard deviation of inverse depths about the plane, relative to the plane's."""
     flow_std: float = 0.0
@@ -174,7 +174,7 @@ class Stretch:
         return float(np.hypot(np.sqrt(variance), ACCEL_SCALE_STD * nearness[0]))
 
     def place(self, window: int, time_s: Array) -> Array:
-        """Camera's centre (n, 3) from its place at the window's middle, world axes."""
+        """Camera centre (n, 3) relative to its position at the window's middle, world axes."""
         moves = self.fit.ground.displacement
         assert moves is not None
         velocity = np.broadcast_to(self.scene.velocity_m_s[window], (len(time_s), 3))
@@ -238,7 +238,7 @@ class FrameMotion:
     """(3,) mean over the frame, without gravity."""
     depth: FrameDepth
     unscaled: str = ""
-    """Why only velocity over depth is known, not metres; empty: metres are."""
+    """Why velocity is known only over depth, not in metres; empty if it is known in metres."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,7 +49,7 @@ def t_ratio(values: NDArray[np.float64]) -> float:
 
 
 def chance_of(values: NDArray[np.float64]) -> float:
-    """One-sided p-value of a t test that the mean of values (n,) is positive; 0.5 for fewer than three."""
+    """One-sided p value of a t test that the mean of values (n,) is positive; 0.5 for fewer than three."""
     return student_tail(t_ratio(values), max(len(values) - 1, 1))
 
 

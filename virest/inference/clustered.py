@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-ALMOST_NOTHING = 1e-9
+RELATIVE_FLOOR = 1e-9
 
 
 def scatter(pull: Array, group: Index, *, about_mean: bool = False) -> Array:
@@ -85,7 +85,7 @@ class CovarianceModel:
         places = np.maximum(_diagonal(slope @ self.by_region @ back), 0.0)
         share = np.sqrt(1 + places / np.maximum(_diagonal(sandwich), 1e-300))
         total = sandwich * share[..., :, None] * share[..., None, :] + slope @ self.prior @ back
-        return raised(total + ALMOST_NOTHING * least, least)  # keeps variances positive if all errors cancel
+        return raised(total + RELATIVE_FLOOR * least, least)  # keeps variances positive if all errors cancel
 
 
 def _diagonal(matrix: Array) -> Array:

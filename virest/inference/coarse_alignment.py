@@ -78,7 +78,7 @@ class CoarseAlignment:
         return float(np.max(self.explained_at, where=np.abs(self.offset_s - offset_s) <= within_s, initial=-np.inf))
 
     def doubt(self, pairs: int, focal_px: float) -> tuple[str, str] | None:
-        """Why the offset is not to be trusted, and what to do; None: it is."""
+        """(why the offset is not trustworthy, what to do); None if it is trustworthy."""
         motion_px = self.motion_rad * focal_px
         if motion_px < MIN_MOTION_PX:
             return (
@@ -180,7 +180,7 @@ def align_with_skew(
 
 
 def axis_maps() -> Array:
-    """The 24 rotations that take axes to axes, (24, 3, 3)."""
+    """The 24 rotations that map coordinate axes to coordinate axes, (24, 3, 3)."""
     maps = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):

@@ -46,11 +46,11 @@ class TriangulatedPoints:
     window: NDArray[np.intp]
     """(n,)."""
     place_m: Array
-    """(n, 3) world axes, from the camera's centre at the window's middle."""
+    """(n, 3) world axes, relative to the camera centre at the window's middle."""
     time_s: Array
     """(n,) when first seen, IMU clock."""
     inverse_depth_per_m: Array
-    """(n,) along the optical axis of the first sight."""
+    """(n,) along the optical axis of the first observation."""
     std_per_m: Array
     """(n,)."""
 
@@ -72,9 +72,9 @@ class Sightings:
     pair: NDArray[np.intp]
     """(n,) number of the pair of frames."""
     from_m: Array
-    """(n, 3) the camera's centre, world axes, from its place at the window's middle."""
+    """(n, 3) camera centre, world axes, relative to its position at the window's middle."""
     rays: Array
-    """(n, 3) with z = 1, camera axes at the sight."""
+    """(n, 3) with z = 1, camera axes at the observation."""
     above_per_m: Array
     """(n,) inverse depth above the window's plane."""
     across: Array
@@ -129,7 +129,7 @@ def triangulate(known: IntegratedMotion, scene: InertialMotion, table: TrackTabl
 def triangulate_relief(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> Sightings:
     """Find the inverse depth of every matched point that the parallax determines, at any distance from the plane.
 
-    Points off their parallax line are dropped: they are mismatches or move on their own.
+    Points off their parallax line are dropped: they are mismatches or move independently.
     """
     sights = _sights(known, scene, table, RELIEF_PASSES, RELIEF_REACH)
     expected = sights.points.inverse_depth_per_m - sights.above_per_m

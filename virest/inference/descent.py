@@ -183,7 +183,7 @@ def descend(
     if not system.prior.size:
         return system
 
-    def taken_anew(limit: Slopes) -> System[S, L]:
+    def reevaluated(limit: Slopes) -> System[S, L]:
         return evidence.weighed(system.state, evidence.look(system.state, system.look, limit))
 
     damping = 0.0
@@ -194,7 +194,7 @@ def descend(
         small = damping < 1 and step @ system.normal @ step < CONVERGED**2 * len(step)
         if after.cost(system.scale) > system.cost(system.scale) * (1 + 1e-9):
             if system.look.is_stale(Slopes.HERE):
-                system = taken_anew(Slopes.HERE)
+                system = reevaluated(Slopes.HERE)
                 continue
             damping = max(10 * damping, FIRST_DAMPING)
             if small or damping > MAX_DAMPING:
@@ -204,9 +204,9 @@ def descend(
         if small and not system.look.is_stale(Slopes.AT_THE_END):
             break
         if small:
-            system = taken_anew(Slopes.AT_THE_END)
+            system = reevaluated(Slopes.AT_THE_END)
     if fresh and system.look.is_stale(Slopes.AT_THE_END):
-        system = taken_anew(Slopes.AT_THE_END)
+        system = reevaluated(Slopes.AT_THE_END)
     return system
 
 

@@ -23,7 +23,7 @@ RUN_S, MIN_RUN_FRAMES, MAX_RUN_FRAMES = 1.5, 20, 80
 def high_motion_frames(
     frames: Sequence[Frame], imu: ImuSamples, max_frames: int, time_offset_s: float = 0.0
 ) -> list[int]:
-    """Movie indices, rising: all usable frames of a short capture, else high-motion runs, max_frames in all."""
+    """Movie indices, ascending: all usable frames of a short capture, else high-motion runs, max_frames in all."""
     usable = [frame for frame in frames if frame.skip_reason is None]
     return sorted(set(choose_pairs(frames, imu, max_frames, run_frames(usable), time_offset_s)))
 

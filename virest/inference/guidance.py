@@ -43,7 +43,7 @@ class GyroGuide:
     stamp_s: Array
     """(frames,) by movie index, camera clock from stamp_0; NaN if the timestamp or the log is unreliable."""
     exposure_s: Array
-    """(frames,) as logged; 0 where unknown."""
+    """(frames,) as of :func:`virest.inference.observed_tracks.frame_times`."""
 
     def seen_before(self, first: int, second: int, shape: tuple[int, int], factor: int) -> MapBetween | None:
         """The map from points of the second frame to the first; None without timestamps.
@@ -108,10 +108,10 @@ class MapBetween:
                 break
         return found
 
-    def carried(self, first: Picture) -> Picture:
+    def warped(self, first: Picture) -> Picture:
         """The first picture warped to the second, and blurred if the second is more blurred."""
         height, width = self.shape
-        down, across = (_all_places(length) for length in self.shape)
+        down, across = (_pixel_basis(length) for length in self.shape)
         values = self.coefficients.astype(np.float32)
         grid_x, grid_y = ((down @ values[..., c]) @ across.T for c in (0, 1))
         grid_x += np.arange(width, dtype=np.float32)
@@ -119,7 +119,7 @@ class MapBetween:
         shown = cv2.remap(first, grid_x, grid_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         return _blurred(np.asarray(shown, np.uint8), self.first_lacks)
 
-    def evened(self, second: Picture) -> Picture:
+    def blurred(self, second: Picture) -> Picture:
         """The second picture, blurred if the first is more blurred."""
         return _blurred(second, self.second_lacks)
 
@@ -182,13 +182,13 @@ def _blurred(picture: Picture, covariance: Array | None) -> Picture:
 
 
 def _nodes() -> Array:
-    """Chebyshev nodes (NODES,) in [-1, 1], rising."""
+    """Chebyshev nodes (NODES,) in [-1, 1], ascending."""
     return -np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
 
 
-def _basis(places: Array) -> Array:
-    """Chebyshev polynomials (n, NODES) at places (n,)."""
-    return np.asarray(np.polynomial.chebyshev.chebvander(places, NODES - 1), float)
+def _basis(positions: Array) -> Array:
+    """Chebyshev polynomials (n, NODES) at positions (n,) in [-1, 1]."""
+    return np.asarray(np.polynomial.chebyshev.chebvander(positions, NODES - 1), float)
 
 
 @lru_cache(maxsize=1)
@@ -198,6 +198,6 @@ def _weights() -> Array:
 
 
 @lru_cache(maxsize=4)
-def _all_places(length: int) -> NDArray[np.float32]:
-    """Polynomials (length, NODES) at all pixels of a side."""
+def _pixel_basis(length: int) -> NDArray[np.float32]:
+    """Chebyshev polynomials (length, NODES) at all pixels of a side."""
     return _basis(np.linspace(-1, 1, length)).astype(np.float32)

@@ -94,7 +94,7 @@ def track_guided(
     each: ParallelMap = one_by_one,
     progress: Callable[[int], None] | None = None,
 ) -> list[TrackPair]:
-    """Track points through frames (movie indices, rising) like :func:`track_frames`, guided if the frames allow it."""
+    """Track points through frames (movie indices, ascending) like :func:`track_frames`, guided if the frames allow."""
     return track_frames(gray, frames, each, progress, find_guide(capture, profile, gray, frames))
 
 

@@ -38,7 +38,7 @@ class ObservedTracks:
     stamp_s: Array
     """(frames,) by movie index, camera clock from stamp_0."""
     exposure_s: Array
-    """(frames,) as logged; 0 where unknown."""
+    """(frames,) as logged; missing ones are the median, or 0 if most are missing."""
     exposure_known: bool
     noise_px: Array
     """(pairs,) standard deviation of a step per coordinate."""
@@ -78,14 +78,14 @@ class ObservedTracks:
         return self.chosen(use)
 
     def without_astray(self, first_px: Array, distance: Array) -> tuple[ObservedTracks, float]:
-        """Drop image regions that move on their own; also returns the dropped fraction of the points."""
+        """Drop image regions that move independently; also returns the dropped fraction of the points."""
         astray = self.astray_cells(first_px, distance)
         if not astray.any():
             return self, 0.0
         return self.without_cells(astray), float(astray[self.cells(first_px)].mean())
 
     def astray_cells(self, first_px: Array, distance: Array) -> NDArray[np.bool_]:
-        """Mask (CELLS²,) of cells of the picture that move on their own: a dashboard, a passer-by.
+        """Mask (CELLS²,) of cells of the picture that move independently: a dashboard, a passer-by.
 
         first_px (n, 2), distance (n,): points of a fit and their residuals, in standard deviations.  A cell counts if
         its median residual exceeds ASTRAY times the typical cell's; none count if they would hold most points.
@@ -129,7 +129,7 @@ class ObservedTracks:
 
 
 def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile) -> ObservedTracks:
-    """Keep the pairs with enough points and known timestamps; missing exposures are set to the median."""
+    """Keep the pairs with enough points and known timestamps."""
     stamp_s, exposure_s, known = frame_times(capture)
     kept = tuple(
         pair for pair in pairs if len(pair) >= MIN_TRACKS and np.isfinite(stamp_s[[pair.first, pair.second]]).all()
@@ -139,7 +139,10 @@ def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: Camera
 
 
 def frame_times(capture: Capture) -> tuple[Array, Array, bool]:
-    """Timestamps and logged exposures (frames,) by movie index, and whether exposures are known; if not, they are 0."""
+    """(timestamps (frames,) by movie index, exposures (frames,), whether most exposures are logged).
+
+    Missing exposures are the median; if most are missing, all missing ones are 0.
+    """
     stamp_s = np.array([frame.time_s for frame in capture.frames], float)
     exposure_s = np.array([np.nan if f.exposure_s is None else f.exposure_s for f in capture.frames], float)
     known = bool(np.isfinite(exposure_s).mean() > 0.5)

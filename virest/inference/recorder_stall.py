@@ -81,7 +81,7 @@ def fit_stall(
     repeats = [
         k
         for k in slots
-        if stall[0] < k <= stall[1] and np.linalg.norm(expected[k]) > MOVED_PX and _stands(pairs.get(k))
+        if stall[0] < k <= stall[1] and np.linalg.norm(expected[k]) > MOVED_PX and _is_repeat(pairs.get(k))
     ]
     seen = [k for k in slots if pairs.get(k) is not None and k not in repeats]
     turned = np.array([picture_rotation(lens, pairs[k]) for k in seen]).reshape(-1, 3) * lens.fx_px
@@ -152,7 +152,7 @@ def _pair(pictures: Mapping[int, NDArray[np.uint8]], k: int) -> TrackPair | None
     return found[0] if found and len(found[0]) >= MIN_TRACKS else None
 
 
-def _stands(pair: TrackPair | None) -> bool:
+def _is_repeat(pair: TrackPair | None) -> bool:
     """Whether a frame repeats its predecessor; identical frames give no pair."""
     if pair is None:
         return True

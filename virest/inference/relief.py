@@ -108,7 +108,7 @@ def picture_grid(lens: MovingLens, time_s: float) -> Grid:
     return Grid(low, (high - low) / cells, int(cells[0]) + 1, int(cells[1]) + 1)
 
 
-# ── how rough ────────────────────────────────────────────────────────────────────────────────────────────────────
+# ── roughness ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def measure_roughness(sights: Sightings, grid: Grid) -> Roughness | None:
@@ -180,7 +180,7 @@ class View:
     rotation_world_cam: Array
     """(3, 3)."""
     centre_m: Array
-    """(3,) world axes, from its place at the window's middle."""
+    """(3,) world axes, relative to its position at the window's middle."""
     plane_per_m: Array
     """(3,) camera axes."""
 

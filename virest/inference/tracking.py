@@ -64,10 +64,10 @@ class Between(Protocol):
     def second_of(self, points_px: Array) -> Array:
         """Positions in the second picture of points (n, 2) of the first."""
 
-    def carried(self, first: Picture) -> Picture:
+    def warped(self, first: Picture) -> Picture:
         """The first picture warped to the second, and blurred if the second is more blurred."""
 
-    def evened(self, second: Picture) -> Picture:
+    def blurred(self, second: Picture) -> Picture:
         """The second picture, blurred if the first is more blurred."""
 
 
@@ -138,7 +138,7 @@ def track_frames(
     progress: Callable[[int], None] | None = None,
     guide: Guide | None = None,
 ) -> list[TrackPair]:
-    """Track points through frames (movie indices, rising) in parts, with the same result as in a single stream.
+    """Track points through frames (movie indices, ascending) in parts, with the same result as in a single stream.
 
     gray: yields (index, picture) of the requested frames; picklable if ``each`` sends parts to processes.  progress is
     called with the number of frames of each finished part.
@@ -155,9 +155,9 @@ def track_frames(
 
 def _parts(frames: Sequence[int]) -> list[tuple[list[int], int]]:
     """Parts of the runs of consecutive frames, each with its lead frames, and the index of its first own frame."""
-    rising = np.array(sorted(set(frames)), np.intp)
+    ascending = np.array(sorted(set(frames)), np.intp)
     parts: list[tuple[list[int], int]] = []
-    for run in np.split(rising, np.flatnonzero(np.diff(rising) > 1) + 1):
+    for run in np.split(ascending, np.flatnonzero(np.diff(ascending) > 1) + 1):
         cuts = np.linspace(0, len(run), -(-len(run) // PART_FRAMES) + 1).round().astype(int)
         for start, end in pairwise(cuts):
             parts.append((run[max(start - LEAD_FRAMES, 0) : end].tolist(), int(run[start])))
@@ -243,32 +243,35 @@ def _guided(
     The first picture is warped into the second, rotation and shear included, before matching.  A point found far from
     its prediction is dropped if the warped picture looks the same there: repetitive texture.
     """
-    put = np.clip(between.second_of(start.astype(float)), -OUTSIDE_PX, OUTSIDE_PX).astype(np.float32)
-    carried, evened = between.carried(first), between.evened(second)
-    ahead, good, distance = put.copy(), np.zeros(len(put), bool), np.zeros(len(put), np.float32)
-    guided, plain = (carried, evened, put, settings.guided_levels), (first, second, start, settings.pyramid_levels)
+    predicted = np.clip(between.second_of(start.astype(float)), -OUTSIDE_PX, OUTSIDE_PX).astype(np.float32)
+    warped, blurred = between.warped(first), between.blurred(second)
+    ahead, good, distance = predicted.copy(), np.zeros(len(predicted), bool), np.zeros(len(predicted), np.float32)
+    guided, plain = (
+        (warped, blurred, predicted, settings.guided_levels),
+        (first, second, start, settings.pyramid_levels),
+    )
     for before, after, begun, levels in (guided, plain):
-        missing = np.flatnonzero(_inside(put, second, settings) & ~good)
+        missing = np.flatnonzero(_inside(predicted, second, settings) & ~good)
         if len(missing):
             ahead[missing], good[missing], distance[missing] = _there_and_back(
                 before, after, begun[missing], settings, levels
             )
-    far = np.flatnonzero(good & (np.linalg.norm(ahead - put, axis=-1) > settings.repeats_from_px))
-    good[far[_repeats(carried, evened, put[far], ahead[far], settings)]] = False
+    far = np.flatnonzero(good & (np.linalg.norm(ahead - predicted, axis=-1) > settings.repeats_from_px))
+    good[far[_repeats(warped, blurred, predicted[far], ahead[far], settings)]] = False
     return ahead, good, distance
 
 
 def _repeats(
-    carried: Picture, second: Picture, put: Points, ahead: Points, settings: TrackingSettings
+    warped: Picture, second: Picture, predicted: Points, ahead: Points, settings: TrackingSettings
 ) -> NDArray[np.bool_]:
     """Mask (n,): the warped picture at the found position matches the second picture about as well as the point itself.
 
     Compares squared differences of patches normalised in mean and contrast; for repetitive texture both are noise.
     """
-    if not len(put):
+    if not len(predicted):
         return np.zeros(0, bool)
     there = _patches(second, ahead, settings.window_px)
-    own, others = (_patches(carried, at, settings.window_px) for at in (put, ahead))
+    own, others = (_patches(warped, at, settings.window_px) for at in (predicted, ahead))
     unlike_own, unlike_others = (1 - (there * patches).sum(axis=1) for patches in (own, others))
     return np.asarray(unlike_others < REPEATS * unlike_own)
 

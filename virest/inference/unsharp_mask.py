@@ -103,7 +103,7 @@ class Overshoot:
     """Median over all edges."""
     of_sharpest: float
     p_value: float
-    """p-value of the more significant of the two for unsharpened pictures, corrected for two tests."""
+    """p value of the more significant of the two for unsharpened pictures, corrected for two tests."""
     sharpest_std: float
     """Standard deviation of the sharpest edges' overshoot for unsharpened pictures."""
     sharpest: Array

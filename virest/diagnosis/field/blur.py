@@ -208,7 +208,7 @@ def _significant_score(edges: _Edges, form: _Form, forms: int) -> Scored | None:
     over_time = form.covariate != "radius"
     design = Design(form.covariate, (form.weights * slope[:, None])[order, None], over_time)
     (scored, *_) = score_forms(
-        left[order, None], weight[order], tangent[order, None], [design], form.block[order], asked=forms
+        left[order, None], weight[order], tangent[order, None], [design], form.block[order], forms_tested=forms
     ) or (None,)
     if scored is None:
         return None

@@ -95,8 +95,8 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile, g
     scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
     weight = 1 / (1 + (left / (CAUCHY * scale)) ** 2) / scale**2
     tangent = _tangent(seen, profile, at, gains) / seen.noise[:, None]
-    asked = [Design("gain", design[order, None], over_time=False)]
-    (scored, *_) = score_forms(left[order, None], weight[order], tangent[order, None], asked, block[order]) or (None,)
+    designs = [Design("gain", design[order, None], over_time=False)]
+    (scored, *_) = score_forms(left[order, None], weight[order], tangent[order, None], designs, block[order]) or (None,)
     if scored is None or scored.parts_gain is None or scored.p_value > MAX_P:
         return None
     size = float(np.sqrt(max(scored.gain.sum(), 0.0) / weight.sum())) * float(np.median(seen.noise))

@@ -80,11 +80,11 @@ class FieldForm:
 
     @property
     def is_pair(self) -> bool:
-        """Whether it is the interaction of two covariates beyond the effect of per_value."""
+        """Whether it is the interaction of two covariates beyond the effect of each."""
         return self.fields[0].is_pair
 
     def values(self, numbers: Array) -> list[Array]:
-        """Values (knots, components) of per_value field."""
+        """Values (knots, components) of each field."""
         flat = self.basis @ numbers
         ends = np.cumsum([np.size(field.values) for field in self.fields])
         return [
@@ -121,7 +121,7 @@ class FieldForm:
         return next((known for known in profile.fields if _adds_to(field, known)), field)
 
     def finer(self, profile: CameraProfile, known: frozenset[str]) -> FieldForm | None:
-        """The same with about twice the knots, or PLACE_KNOTS − 1 more along per_value side; None at the maximum."""
+        """The same with about twice the knots, or PLACE_KNOTS − 1 more along each side; None at the maximum."""
         return None if self.refine is None else self.refine(profile, known)
 
     def about(self, profile: CameraProfile, known: frozenset[str]) -> FieldForm:

@@ -113,7 +113,7 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
     block = _blocks(columns, len(left))
     forms = _forms(columns)
     pairs = _pairs(columns)
-    asked = len(forms) + len(pairs)
+    forms_tested = len(forms) + len(pairs)
     tangent = np.broadcast_to(np.eye(2), (len(left), 2, 2)).copy()
     rms_px = _scale(left)
     found: list[tuple[_Form, float, tuple[str, ...], float, float]] = []
@@ -126,7 +126,7 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
             open_forms = [form for form in group if form.name not in taken]
             designs = [Design(form.name, form.design / scale, form.over_time) for form in open_forms]
             everything = np.concatenate([tangent, *beside], axis=-1)
-            scored = score_forms(current / scale, weight, everything, designs, block, asked=asked)
+            scored = score_forms(current / scale, weight, everything, designs, block, forms_tested=forms_tested)
             selection = select(scored, float(weight.sum()))
             if selection is not None and selection.size * scale >= MIN_SIZE_PX:
                 break

@@ -68,7 +68,7 @@ class Scored:
     name: str
     numbers: int
     p_value: float
-    """For the by_block set of forms."""
+    """For the whole set of forms."""
     gain: Array
     """(blocks,) reduction of the squared whitened residual in held-out blocks."""
     parts_gain: Array | None
@@ -123,13 +123,13 @@ def score_forms(
     block: Index,
     time_block: Index | None = None,
     seed: int = 0,
-    asked: int | None = None,
+    forms_tested: int | None = None,
 ) -> list[Scored]:
     """Score forms, best gain first.
 
     left: (n, d) residuals in standard deviations; weight (n,); tangent (n, d, m); block (n,) number of
-    the block of time, rising; time_block (n,) the same for shorter intervals within blocks, on which forms over time
-    are tested, because only a few blocks cover each knot.  asked: total number of forms tested; None: these.
+    the block of time, ascending; time_block (n,) the same for shorter intervals within blocks, on which forms over time
+    are tested, because only a few blocks cover each knot.  forms_tested: total number of forms tested; None: these.
     """
     root = np.repeat(np.sqrt(weight), left.shape[1])[:, None]
     frame = _orthonormal(tangent.reshape(len(root), -1) * root)
@@ -143,7 +143,7 @@ def score_forms(
     summed = (_summed(k, form, root, frame, error, of_row, 2 * len(time_blocks)) for k, form in enumerate(designs))
     blocks = [entry for entry in summed if entry is not None]
     signs = np.random.default_rng(seed).choice((-1.0, 1.0), (FLIPS, len(time_blocks)))
-    scored = [_scored(entry, coarse, signs, asked or len(blocks)) for entry in blocks]
+    scored = [_scored(entry, coarse, signs, forms_tested or len(blocks)) for entry in blocks]
     return sorted(scored, key=lambda s: -float(s.gain.sum()))
 
 

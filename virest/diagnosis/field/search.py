@@ -75,12 +75,12 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
     """Add the fields that the residuals support to the ladder's verdict; unchanged where they support none."""
     # keep the bridges of the log fixed: they have hundreds of parameters that no field shares
     terms = tuple(term for term in found.model.terms if OVER not in term.name)
-    state, fitted = _Description(replace(found.model, terms=terms), tuple(found.accepted), ()), found.fit
+    state, fitted = _SearchState(replace(found.model, terms=terms), tuple(found.accepted), ()), found.fit
     fields: list[FittedField] = []
     for _ in range(MAX_FIELDS):
-        asked = _asked_for(evidence, capture, state.model, fitted)
+        proposals = _proposals(evidence, capture, state.model, fitted)
         judged = _Judged(evidence, state.model, fitted)
-        steps = (_best_step(judged, found, state, alternatives) for alternatives in asked)
+        steps = (_best_step(judged, found, state, alternatives) for alternatives in proposals)
         if (step := next((step for step in steps if step is not None), None)) is None:
             break
         chosen, entered, after = step
@@ -113,7 +113,7 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
 
 
 @dataclass(frozen=True, slots=True)
-class _Description:
+class _SearchState:
     """A model with its accepted causes and field forms."""
 
     model: Model
@@ -124,7 +124,7 @@ class _Description:
         """Whether any form has knots as dense as the blocks at this frame period."""
         return any(form.is_dense(2 * PAIRS_IN_BLOCK * period_s) for form in self.forms)
 
-    def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _Description:
+    def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _SearchState:
         """The same without some causes, whose parameters return to their nominal values.
 
         Forms that depend on these causes, such as a displacement on the principal point, restart from 0.
@@ -146,7 +146,7 @@ class _Description:
             if old is not new:
                 less = _without_form(model, old)
                 model = replace(less, terms=(*less.terms, new.term))
-        return _Description(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
+        return _SearchState(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,33 +166,37 @@ class _Judged:
 
 
 def _best_step(
-    judged: _Judged, found: GeometricVerdict, state: _Description, alternatives: Sequence[_Asked]
-) -> tuple[_Asked, _Entered, _Description] | None:
+    judged: _Judged, found: GeometricVerdict, state: _SearchState, alternatives: Sequence[_Proposal]
+) -> tuple[_Proposal, _Entered, _SearchState] | None:
     """Add the form that predicts held-out blocks best; None where no form gains."""
     steps = [step for one in alternatives if (step := _step(judged, found, state, one)) is not None]
     return min(steps, key=lambda step: float(step[1].after.losses.mean()), default=None)
 
 
 def _step(
-    judged: _Judged, found: GeometricVerdict, state: _Description, asked: _Asked
-) -> tuple[_Asked, _Entered, _Description] | None:
-    """Add a requested form and remove what it makes redundant; None where it gains nothing.
+    judged: _Judged, found: GeometricVerdict, state: _SearchState, proposal: _Proposal
+) -> tuple[_Proposal, _Entered, _SearchState] | None:
+    """Add a proposed form and remove what it makes redundant; None where it gains nothing.
 
     A form that replaces a cause needs a lower significance than one that is added to all causes.
     """
-    evidence, entered = judged.evidence, _entered(judged, asked)
+    evidence, entered = judged.evidence, _entered(judged, proposal)
     if entered is None:
         return None
-    more = _Description(entered.model, state.accepted, (*state.forms, entered.form))
+    more = _SearchState(entered.model, state.accepted, (*state.forms, entered.form))
     after = _without_redundant_causes(evidence, found, more)
     gained_px = np.sqrt(max(entered.before.rms**2 - entered.after.rms**2, 0.0)) * evidence.typical_px
-    small = asked.selection is not None and gained_px < MIN_SIZE_PX
-    return None if (small or asked.instead) and len(after.accepted) == len(state.accepted) else (asked, entered, after)
+    small = proposal.selection is not None and gained_px < MIN_SIZE_PX
+    return (
+        None
+        if (small or proposal.instead) and len(after.accepted) == len(state.accepted)
+        else (proposal, entered, after)
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
-    """A form supported by all residuals together, or by those between two frames."""
+class _Proposal:
+    """A form proposed because all residuals together, or those between two frames, support it."""
 
     form: FieldForm
     selection: Selection | None = None
@@ -211,7 +215,7 @@ class _Asked:
         return self.selection.rivals if self.selection else ()
 
 
-def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> Iterator[tuple[_Asked, ...]]:
+def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: TrackFit) -> Iterator[tuple[_Proposal, ...]]:
     """Yield the forms that a model's residuals support, as groups of alternatives, with their significance.
 
     A fast-settling focal length and a sudden change look alike, so both are tried.  Covariate pairs and curves over a
@@ -233,11 +237,11 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     blind_s = FRAMES_PER_STEP * evidence.period_s
     search = _Search(seen, block, blind_s, len(alone) + len(pairs))
     forms = [form for form in alone if form.family not in in_model]
-    plain: list[_Asked] = []
+    plain: list[_Proposal] = []
     sudden = None if any(name.startswith(SCALE_OVER_TIME) for name in in_model) else sudden_change(seen)
     if sudden is not None:
         form = best_instant(seen, capture, sudden.at_s, sudden.scale, evidence.period_s)
-        plain.append(_Asked(form, sudden=sudden))
+        plain.append(_Proposal(form, sudden=sudden))
     smooth = [form for form in forms if not form.local]
     scored = search.scored(tangent, smooth)
     selection = search.best(scored)
@@ -247,16 +251,16 @@ def _asked_for(evidence: Evidence, capture: Capture, model: Model, fitted: Track
         if form.step_s is not None:
             scale = lasting_change(seen, tangent, search.effect(form))
             form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
-        plain.append(_Asked(form, selection, instead=instead))
+        plain.append(_Proposal(form, selection, instead=instead))
     yield tuple(plain)
     forms = [form for form in (*forms, *pairs) if form.local or (form.is_pair and form.family not in in_model)]
     smooth = list({form.family: form for form in reversed(alone) if not form.local and form.step_s is None}.values())
     tangent = np.concatenate([tangent, *map(search.effect, smooth)], axis=-1)
     if (selection := search.best(search.scored(tangent, forms))) is not None:
-        yield (_Asked(forms[selection.best.index], selection),)
+        yield (_Proposal(forms[selection.best.index], selection),)
     elif sudden is not None:
         # a temporary change covers too few frames for the sign-flip test
-        yield from ((_Asked(form, sudden=sudden),) for form in forms if form.local and form.kind == "scale")
+        yield from ((_Proposal(form, sudden=sudden),) for form in forms if form.local and form.kind == "scale")
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +272,7 @@ class _Search:
     blind_s: float
     """Ignore points closer in time to a sudden change than this.  The change moves them by many times their noise, so
     the most informative points would reject an instant that is wrong by one frame."""
-    asked: int
+    forms_tested: int
     """Total number of forms tested."""
     _effects: dict[int, tuple[FieldForm, Array]] = field(default_factory=dict, repr=False)
     """Keyed by id(form); the form is stored too, so that its id is not reused."""
@@ -287,7 +291,7 @@ class _Search:
 
         seen = self.seen
         for entry in score_forms(
-            seen.left, seen.weight, tangent, designs, self.block, seen.table.pair, asked=self.asked
+            seen.left, seen.weight, tangent, designs, self.block, seen.table.pair, forms_tested=self.forms_tested
         ):
             family = forms[entry.index].family
             if family not in best or worth(entry) > worth(best[family]):
@@ -333,21 +337,21 @@ class _Entered:
     after: HeldOut
 
 
-def _entered(judged: _Judged, asked: _Asked) -> _Entered | None:
+def _entered(judged: _Judged, proposal: _Proposal) -> _Entered | None:
     """Add a form with as many knots as improve held-out data; None where held-out blocks do not gain."""
-    evidence, model, fitted, form = judged.evidence, judged.model, judged.fitted, asked.form
+    evidence, model, fitted, form = judged.evidence, judged.model, judged.fitted, proposal.form
     extended = replace(model, terms=(*model.terms, form.term))
     before, after = judged.held_out(form.local), _held_out(evidence, extended, fitted, form.local)
     gain = before.block_loss - after.block_loss
     log.debug("%s held out: %.4f to %.4f, t %.1f", form.name, before.rms, after.rms, t_ratio(gain))
-    least_t = RIVAL_T if asked.instead else MIN_T
+    least_t = RIVAL_T if proposal.instead else MIN_T
     holds = _holds_over_time(gain) if form.over_time and not form.local else t_ratio(gain) > least_t
-    if asked.sudden is not None and not form.local:
+    if proposal.sudden is not None and not form.local:
         # the fit to the other blocks determines the change, and must remove the excess in the block that contains it
-        there = asked.sudden.pair // PAIRS_IN_BLOCK
+        there = proposal.sudden.pair // PAIRS_IN_BLOCK
         excess = max(before.block_loss[there] - float(np.median(before.block_loss)), 0.0)
         holds = bool(gain[there] > MIN_EXCESS_REMOVED * excess)
-    least_gain = 0.0 if asked.instead else MIN_GAIN
+    least_gain = 0.0 if proposal.instead else MIN_GAIN
     if gain.mean() < least_gain * before.block_loss.mean() or after.rms > before.rms or not holds:
         return None
     return _refined(evidence, model, _Entered(extended, form, before, after), fitted)
@@ -406,7 +410,7 @@ def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool
     return HeldOut(np.asarray(loss(left, 1.0)), None if by_point else block, capped_rms(left))
 
 
-def _without_redundant_causes(evidence: Evidence, found: GeometricVerdict, state: _Description) -> _Description:
+def _without_redundant_causes(evidence: Evidence, found: GeometricVerdict, state: _SearchState) -> _SearchState:
     """Remove causes that no longer improve held-out blocks once a field has been added.
 
     Two causes that compensate for each other, such as a rotation and a principal point, must be removed together.
@@ -436,14 +440,14 @@ def _loses_without(judged: _Judged, by_point: bool, less: Model) -> bool:
     return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
 
 
-def _redundant_form(judged: _Judged, state: _Description) -> FieldForm | None:
+def _redundant_form(judged: _Judged, state: _SearchState) -> FieldForm | None:
     """An older form that the newest one makes redundant, if any."""
     by_point = state.is_dense(judged.evidence.period_s)
     less = ((form, _without_form(state.model, form)) for form in state.forms[:-1])
     return next((form for form, model in less if not _loses_without(judged, by_point, model)), None)
 
 
-def _redundant_causes(judged: _Judged, found: GeometricVerdict, state: _Description) -> tuple[Accepted, ...]:
+def _redundant_causes(judged: _Judged, found: GeometricVerdict, state: _SearchState) -> tuple[Accepted, ...]:
     """The cause, or pair of causes, that the model does not need; empty where it needs all."""
     fitting = [entry for entry in state.accepted if entry.effect is not None and entry.effect.term is not None]
     depth = [(entry,) for entry in state.accepted if entry.name == DEPTH]
