@@ -70,6 +70,26 @@ def test_a_coders_noise_is_bounded_by_its_step(length_px: float) -> None:
     assert np.all(known.noise <= unknown.noise * 1.001)
 
 
+def test_a_coders_colour_noise_is_bounded_by_its_step() -> None:
+    """Coloured bars, one sample a square of two pixels, under a path of 5 px; uncertain kernels lift no bound."""
+    field, step = _field(5.0, np.pi / 2), 12.0
+    bars = np.random.default_rng(3).normal(0, 40, WIDTH // 2)
+    sharp = np.repeat(cv2.GaussianBlur(bars[None], (0, 0), 0.9), HEIGHT // 2, axis=0)
+    half = cv2.filter2D(sharp, -1, field.scaled(0.5).arrays()[0].astype(float))
+    red = np.clip(np.rint(128 + cv2.resize(_coded(half, step), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)), 0, 255)
+    grey = 127 + 20 * (texture(HEIGHT, WIDTH, seed=5) - 0.5)
+    planes = np.stack([grey, red, np.full_like(grey, 128)], -1)
+    picture = cv2.cvtColor(planes.astype(np.uint8), cv2.COLOR_YCrCb2RGB)
+    known, doubted, unknown = (
+        measure_picture(picture, field, STRAIGHT, coding_step=given, bounds_luma=bounds)[1].noise
+        for given, bounds in ((step, True), (step, False), (None, True))
+    )
+    np.testing.assert_array_equal(known, doubted)
+    assert np.all(known <= unknown * 1.001)
+    low = slice(2, 8)
+    assert known[low].mean() < 0.5 * unknown[low].mean()
+
+
 @pytest.mark.parametrize("noise_levels", [1.5, 4.0, 8.0])
 @pytest.mark.parametrize("angle_rad", [0.4, 1.9])
 def test_white_noise_is_measured(noise_levels: float, angle_rad: float) -> None:

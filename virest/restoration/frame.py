@@ -326,12 +326,12 @@ def _blur_statistics(
     curve = blur.motion.profile.response or ResponseCurve("srgb")
     centres_px = most_blurred(blur.motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
     few = settings.iterations <= FEW_ITERATIONS
-    # with few iterations and an uncertain path, the path's error counts as noise instead: the coding step is ignored
-    step = None if few and blur.covariance_px2.any() else blur.coding_step
-    field = smooth_field(blur.motion, blur.anchor)
-    luma, chroma = picture_statistics(picture, field(centres_px), curve, FEW_TILES if few else MANY_TILES, step)
-    if few and step is not None:
-        luma = luma.with_coder_noise(step, LEAST_CODER_NOISE)
+    # with few iterations and an uncertain path, the path's error counts as noise instead: the coder's is no bound
+    bounds_luma = not (few and blur.covariance_px2.any())
+    field, most_tiles = smooth_field(blur.motion, blur.anchor), FEW_TILES if few else MANY_TILES
+    luma, chroma = picture_statistics(picture, field(centres_px), curve, most_tiles, blur.coding_step, bounds_luma)
+    if few and bounds_luma and blur.coding_step is not None:
+        luma = luma.with_coder_noise(blur.coding_step, LEAST_CODER_NOISE)
     spread = kernel_spread(field, width, height, blur.covariance_px2)
     luma_model = luma.with_kernel_variance(spread)
     share = 1.0 if blur.anchor != 0.5 else trusted_share(luma_model)

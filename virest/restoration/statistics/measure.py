@@ -30,7 +30,10 @@ _MAX_CLIPPED = 0.002
 """Use tiles with a larger fraction of clipped pixels only if too few tiles have less."""
 
 STORED_COLOUR_PX = 2
-"""Side of the square of pixels that share one colour sample in a 4:2:0 movie."""
+"""Side of the square of pixels that share one colour sample in a 4:2:0 movie.
+
+A sample's error covers the whole square, so the power of the coder's error is the square's area times as high.
+"""
 
 
 def measure_picture(
@@ -40,13 +43,15 @@ def measure_picture(
     clipped: NDArray[np.uint8] | None = None,
     most_tiles: int = MANY_TILES,
     coding_step: float | None = None,
+    bounds_luma: bool = True,
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Fit |G|² = |K|² S + N over tiles at the field's centres, ring by ring.
 
     picture: (height, width, 3) RGB, or luma (height, width), whose statistics are then returned for the chroma too.
     clipped: (height, width), 1 where light is clipped; such pixels, and those that a blur path reaches from them, are
-    left out.  coding_step: the coder's luma quantiser step, grey levels; None: unknown.  Returns the statistics of luma
-    and of chroma, the latter for both colour differences together.
+    left out.  coding_step: the coder's quantiser step, grey levels, which bounds its noise; None: unknown.
+    bounds_luma: False if the luma may hold more, such as the error of uncertain kernels.  Returns the statistics of
+    luma and of chroma, the latter for both colour differences together.
     """
     corners = _corners(field, picture.shape[:2])
     if not corners or field.radius_px >= SIDE // 2:
@@ -73,11 +78,13 @@ def measure_picture(
     )
     luma, *red_blue = _planes(_some_rows(picture))
     cells, white_levels, grey = RingCells(passed), white_noise(luma), observed(0, range(len(parts)))
-    spectra, colour = [(light, cells, white_levels, coding_step), (grey, cells, white_levels, coding_step)], grey
+    luma_step = coding_step if bounds_luma else None
+    spectra, colour = [(light, cells, white_levels, luma_step), (grey, cells, white_levels, luma_step)], grey
     if red_blue:
         colourful = _most_colourful(parts)
+        colour_step = None if coding_step is None else STORED_COLOUR_PX * coding_step
         colour = (observed(1, colourful) + observed(2, colourful)) * np.float32(0.5)
-        spectra.append((colour, RingCells(passed[colourful]), white_noise(red_blue[0]), None))
+        spectra.append((colour, RingCells(passed[colourful]), white_noise(red_blue[0]), colour_step))
     of_light, of_luma, *of_chroma = fit_rings(*spectra)
     of_luma = replace(
         of_luma,

@@ -49,13 +49,14 @@ def picture_statistics(
     curve: ResponseCurve,
     most_tiles: int,
     coding_step: float | None = None,
+    bounds_luma: bool = True,
 ) -> tuple[PictureStatistics, PictureStatistics]:
     """Statistics of luma and chroma of a picture (height, width, 3), or of luma alone (height, width).
 
     Noise shows where the motion paths cancel frequencies; Gaussian defocus, the same in all directions, would hide it.
     So the fit uses the paths alone, which gives the noise and the spectrum of the defocused picture, and defocus is
     divided out afterwards.  If paths are too long for a tile, the picture is measured at reduced size; frequencies
-    above the finest measured one take its values.  coding_step: as in :func:`measure_picture`.
+    above the finest measured one take its values.  coding_step, bounds_luma: as in :func:`measure_picture`.
     """
     sigma_px, times = np.asarray(field.defocus_sigma_px, float), 1
     field = replace(field, defocus_sigma_px=0.0)
@@ -66,7 +67,9 @@ def picture_statistics(
         picture = cv2.resize(picture, (width // times, height // times), interpolation=cv2.INTER_AREA)
         field = replace(field.scaled(1 / times), centres_px=(field.centres_px + 0.5) / times - 0.5)
         coding_step = None if coding_step is None else coding_step / times
-    found = measure_picture(picture, field, curve, clipped_anywhere(picture, curve), most_tiles, coding_step)
+    found = measure_picture(
+        picture, field, curve, clipped_anywhere(picture, curve), most_tiles, coding_step, bounds_luma
+    )
     luma, chroma = (
         without_defocus(one.scaled(times) if times > 1 and one.measured else one, sigma_px).with_error_share(
             CURVE_SLOPE_STD**2
