@@ -144,3 +144,10 @@ def test_candidates_for_the_gain_test_are_blurred_enough():
     assert gain_test_candidates([(0, 1, 2, 3), (4, 5, 6, 7)], path_px) == [2, 4, 3, 1, 5, 6]
     assert gain_test_candidates([(0, 1, 2, 3)], {n: path_px[n] / 4 for n in range(4)}) == [2, 1]
     assert gain_test_candidates([(4, 5, 6, 7)], {n: path_px[n] for n in (4, 5, 7)}) == []
+
+
+def test_a_pair_that_restoring_leaves_alone_says_nothing() -> None:
+    """It neither confirms nor refutes, and makes no share that is no number."""
+    pairs = [(0.8, 1.0, 0.2, 0.1), (0.5, 0.8, 0.2, 0.1)]
+    assert confirmed_gain([*pairs, (0.0, 0.0, 0.2, 0.2)]) == confirmed_gain(pairs)
+    assert confirmed_gain([pairs[0], (0.0, 0.0, 0.2, 0.2)]) is None
