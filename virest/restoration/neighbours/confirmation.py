@@ -114,10 +114,10 @@ def _gain_db(part: float) -> float:
 def confirmed_gain(found: Sequence[tuple[float, float, float, float]]) -> ConfirmedGain | None:
     """The share from pairs of (decrease of the squared error, squared change, part lacked, part left).
 
-    None with fewer than LEAST_PAIRS pairs in which restoring changed anything.  The share is a ratio of sums, since pairs
-    that changed little carry little information.  It is combined with the prior USUAL_SHARE by its scatter (normal
-    distributions; Student's deviation for a mean of few).  A positive share becomes 0 if the restored frames predict
-    the neighbours hardly better than the recorded ones do: what these lack is then not sharpness.
+    None with fewer than LEAST_PAIRS pairs in which restoring changed anything.  The share is a ratio of sums, since
+    pairs that changed little carry little information.  It is combined with the prior USUAL_SHARE by its scatter
+    (normal distributions; Student's deviation for a mean of few).  A positive share becomes 0 if the restored frames
+    predict the neighbours hardly better than the recorded ones do: what these lack is then not sharpness.
     """
     found = [pair for pair in found if pair[1] > 0]
     if len(found) < LEAST_PAIRS:
