@@ -157,7 +157,7 @@ def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
     shape = "" if name == "table" else numbers.removeprefix("gamma ")
     lines = [
         f"{name} {shape}".strip(),
-        f"fit error {facts['rms_grey_levels']:.2f} grey levels rms, exposures {low:.4g} to {high:.4g} covered",
+        f"fit error {facts['rms_grey_levels']:.2f} grey levels rms over exposures {low:.4g} to {high:.4g}",
         f"the curve is known to ± {facts['curve_std_grey_levels']:.2f} grey levels there",
         table(["picture", "exposure_s", "error_ev", "contradicts", "likely_s"], rows),
     ]

@@ -332,11 +332,11 @@ def _text(facts: dict[str, Any]) -> str:
         f"CASE A, rolling shutter: {facts['frames']} frames of {len(facts['captures'])} captures, {facts['versions']}",
         f"\nOne corner, as in the paper's Table 2: {example['corner']}, {example['capture']} frame {example['frame']}",
         _example_table(example),
-        "\nAngles between the board's outer corners (eq 29), |picture - truth| in degrees",
+        "\nAngles between the board's outer corners (eq 29), |frame - truth| in degrees",
         _angle_table(whole, "outer"),
         "\nThe same between neighbouring corners",
         _angle_table(whole, "neighbours"),
-        "\nPictures around the board against truth (PSNR of the mean MSE)",
+        "\nFrames around the board compared with truth (PSNR of the mean MSE)",
         _fidelity_table(whole),
     ]
     if len(facts["by_capture"]) > 1:

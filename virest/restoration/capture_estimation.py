@@ -376,7 +376,7 @@ def _unknowns(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
     """A note for each value that is a documented default."""
     notes = []
     if profile.response is None:
-        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "response curve unknown: srgb taken"))
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "exposure curve unknown: srgb assumed"))
     if not profile.readout_known:
         notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "readout time unknown: 0 taken, rows are not straightened"))
     if all(frame.exposure_s is None for frame in capture.frames):

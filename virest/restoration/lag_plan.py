@@ -42,7 +42,7 @@ def at_lag(capture: Capture, profile: CameraProfile, lag: StartUpLag) -> Capture
 def with_lag(plan: RestorationPlan, lag: StartUpLag) -> RestorationPlan:
     """A plan made for true times, with the lag in its profile and in what is said."""
     contradicted = None if plan.contradicted is None else _followed(plan.contradicted, lag)
-    said = f"frame lag of {lag.lag_s:.2f} s at the start: the first {lag.frames} frames are taken at their true times"
+    said = f"recorder lag of {lag.lag_s:.2f} s: the first {lag.frames} frames are used at their true times"
     profile = _followed(plan.profile, lag)
     return replace(plan, profile=profile, contradicted=contradicted).noted(NoteCode.TRUE_TIMES, said)
 

@@ -204,4 +204,4 @@ def _text(facts: dict[str, Any]) -> str:
     ]
     title = f"SOAK: {facts['captures']} captures in one run, {facts['seconds']:.0f} s; second quarter -> last quarter\n"
     said = "\n".join(f"  {way}: {line[:150]}" for way, line in facts["explanations"].items())
-    return title + table(["what", "found", "wanted"], rows) + "\n" + said
+    return title + table(["what", "found", "expected"], rows) + "\n" + said

@@ -113,10 +113,10 @@ def deblur(
     \b
     $ virest evaluate deblur
     CASE B, motion blur: 12 frames, ...
-    method                          MSE  PSNR dB    SSIM  matches  in place
-    blurred                       606.2    20.30  0.7464      196       170
-    skimage richardson_lucy       359.0    22.58  0.7595      307       277
-    virest balanced                87.8    28.70  0.9206      727       681
+    method                          MSE  PSNR dB    SSIM  matches  correct
+    blurred                       606.2    20.30  0.7464      196      170
+    skimage richardson_lucy       359.0    22.58  0.7595      307      277
+    virest balanced                87.8    28.70  0.9206      727      681
     ...
     $ virest evaluate deblur --over-time
     $ virest evaluate deblur --restored virest-out/leaves/frames --reference leaves/truth/frames
