@@ -80,7 +80,7 @@ def read_source(source: Path, exposures: Path | None) -> tuple[list[Still], list
 
 
 def as_json(fit: CurveFit, stills: list[Still], notes: list[str]) -> dict[str, Any]:
-    """The result in the form of contract section 1."""
+    """The result as a mapping, for ``--json``."""
     return {
         "response": _rounded(response_block(fit.curve)),
         "rms_grey_levels": fit.rms_grey_levels,

@@ -357,7 +357,7 @@ def _example_table(example: Mapping[str, Any]) -> str:
 def _angle_table(summary: Mapping[str, Any], key: str) -> str:
     rows = [[method, *_angle_cells(found[key])] for method, found in summary["methods"].items()]
     rows.append(["(detector on truth)", *_angle_cells(summary["detector_on_truth"][key])])
-    return _table(["method", "mean", "spread", "max", "relative %", "angles"], rows)
+    return _table(["method", "mean", "std", "max", "relative %", "angles"], rows)
 
 
 def _angle_cells(found: Mapping[str, Any]) -> list[str]:

@@ -234,7 +234,8 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = [("kind", facts["kind"])] if "kind" in facts else []
     if movie := facts.get("movie"):
         size = f"{movie['width']}x{movie['height']}"
-        rows.append(("movie", f"{size}, {movie['frames']} frames, {movie['keyframes']} key frames"))
+        keys = f"{movie['keyframes']} key frame{'s' if movie['keyframes'] != 1 else ''}"
+        rows.append(("movie", f"{size}, {movie['frames']} frames, {keys}"))
     rows += [("counts", text) for text in _wrapped(facts["counts"])]
     for name, reasons in facts["dropped"].items():
         rows.append(("dropped", f"{name}: " + ", ".join(f"{n} {reason}" for reason, n in reasons.items())))

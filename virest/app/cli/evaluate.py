@@ -58,7 +58,7 @@ def shutter(
     \b
     $ virest evaluate shutter
     CASE A, rolling shutter: 50 frames of 5 captures, ...
-    method                 mean  spread     max  relative %  angles
+    method                 mean     std     max  relative %  angles
     none                 1.6641  1.9543  3.9687      1.8514     200
     schubert2018         0.3409  0.4457  1.7406      0.3798     200
     perspective          0.5059  0.6177  1.2699      0.5605     200
