@@ -113,11 +113,13 @@ HEAD = f"""<!-- Written by `make figures`; edit virest/app/gallery.py instead. -
 # Gallery: what each effect looks like
 
 Each capture below has one effect hidden in it by `virest simulate --effect`; `virest diagnose` reads the capture alone.
-Captures have {FRAMES} frames of {WIDTH}×{HEIGHT} (seed {SEED}). Grey curves show the residuals of the profile as
-given, blue curves those after the named causes are built in: medians and the central 68 %. As in all output of
-`diagnose`, the rms caps residuals above {CAP:g} times the typical one, so that lost tracks do not dominate. For effects
-that show in brightness or blur, bars show the held-out error that each candidate leaves; the red line is the error
-without any.
+Captures have {FRAMES} frames of {WIDTH}×{HEIGHT} (seed {SEED}).
+
+- **Curves** show residuals, medians and the central 68 %: grey with the profile as given, blue after the named causes
+  are built in. The legend gives the rms over all frames, the text that over held-out frames. As in all output of
+  `diagnose`, residuals above {CAP:g} times the typical one are capped, so that lost tracks do not dominate.
+- **Bars** show the error that each candidate leaves on the rung where the cause entered; the red line is the error
+  before that rung. For brightness these are errors of the fit, so they differ from the held-out errors in the text.
 
 """
 

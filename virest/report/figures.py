@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.calibration.response_curve import CurveFit
+from virest.effects.records import PHOTOMETRY
 
 FORMATS = ("png", "svg", "pdf")
 MAX_POINTS = 12_000
@@ -202,7 +203,10 @@ def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str 
 
 
 def _draw_rung(axes: Any, rung: RungBars, most: int, name: str) -> None:
-    """Bars of one rung, as thick as if there were ``most`` of them; the error before stands above its line."""
+    """Bars of one rung, as thick as if there were ``most`` of them; the error before stands above its line.
+
+    Brightness is mostly judged by the fit itself, everything else on held-out frames.
+    """
     quantity, before, tried, entered = rung
     known = sorted((after, name) for name, after in tried.items() if np.isfinite(after))
     names = [name for _, name in known]
@@ -215,7 +219,8 @@ def _draw_rung(axes: Any, rung: RungBars, most: int, name: str) -> None:
         side = "right" if before > 0.5 * axes.get_xlim()[1] else "left"
         axes.annotate(f"before: {before:.3g}", (before, 1), xycoords=("data", "axes fraction"), xytext=(0, 3),
                       textcoords="offset points", ha=side, color="crimson", fontsize=8)  # fmt: skip
-    axes.set_xlabel(f"{literal(quantity)}, held-out frames")
+    held_out = "" if quantity == PHOTOMETRY else ", held-out frames"
+    axes.set_xlabel(literal(quantity) + held_out)
     if name:
         axes.set_title(literal(name), fontsize=10, pad=18)
 
