@@ -474,7 +474,7 @@ def test_the_quality_table_sums_up_only_kinds_of_several_captures() -> None:
     frames = [("leaves", "ordinary"), ("phone-calm", "phone"), ("phone-fast", "phone")]
     rows = [{"capture": name, "kind": kind, "frame": 0, "in_range": True, "straightened_db": 20.0,
              "gain_db": {**gains, "fast": 0.25 + number}} for number, (name, kind) in enumerate(frames)]  # fmt: skip
-    means, worst = quality._text(quality.summarise(rows)).split("the same of the worst frame")
+    means, worst = quality._text(quality.summarise(rows)).split("the same for the worst frame")
     assert "ALL ordinary" not in means
     assert means.splitlines()[-2].split()[-7:-5] == ["20.00", "+1.75"]
     assert worst.splitlines()[-1].split()[-3:] == ["+1.25", "+1.00", "+1.00"]

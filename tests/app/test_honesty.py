@@ -19,7 +19,7 @@ def promised(of: str, capture: str, preset: str, frame: int, promise: float | No
 
 
 HONEST_ROWS = [
-    promised("obedient", "leaves", "fast", 0, 2.0, 2.5),
+    promised("nominal", "leaves", "fast", 0, 2.0, 2.5),
     promised("phone", "calm", "fast", 0, 1.0, -0.5),
     promised("phone", "calm", "fast", 1, 0.5, 0.6),
     promised("phone", "calm", "fast", 2, None, 0.0),
@@ -37,7 +37,7 @@ def test_honesty_counts_losses_and_the_promises_made_for_them() -> None:
     assert phones["worse_mean_db"] == pytest.approx(-1.0)
     assert phones["worst_db"] == pytest.approx(-1.5)
     assert phones["promise_off"] == pytest.approx(1.5)
-    assert found["obedient", None]["worse_mean_db"] is None
+    assert found["nominal", None]["worse_mean_db"] is None
     assert found["phone", "dim"]["of"] == 1
 
 
@@ -52,9 +52,9 @@ def test_the_honesty_tables_mark_every_frame_that_was_made_worse() -> None:
         for row in summary.summary_rows({"honesty": {"summary": honesty.summarise_honesty(HONEST_ROWS)}})
     }
     assert rows["phone, fast: mean gain"].met == summary.NO
-    assert rows["obedient, fast: mean gain"].met == summary.OPEN
+    assert rows["nominal, fast: mean gain"].met == summary.OPEN
     assert rows["phone, fast: frames made worse"].met == summary.NO
-    assert rows["obedient, fast: frames made worse"].met == summary.YES
+    assert rows["nominal, fast: frames made worse"].met == summary.YES
     assert "ALL PHONE" in honesty.honesty_text(honesty.summarise_honesty(HONEST_ROWS))
 
 

@@ -53,7 +53,7 @@ def test_a_camera_at_rest_tells_nothing_with_exposures_or_without(at_rest: Path)
     found = diagnose_folder(at_rest)
     assert (found.verdict, found.causes) == (CONSISTENT, ())
     assert any("at rest" in note for note in found.notes)
-    assert any("known exposures" in note and "blur not judged" in note for note in found.notes)
+    assert any("known exposures" in note and "blur was not tested" in note for note in found.notes)
 
 
 @pytest.mark.parametrize("turned_deg", [(90, 0, 0), (0, 0, 180), (0, -90, 90)])

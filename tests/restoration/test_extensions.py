@@ -219,7 +219,7 @@ def test_a_stabilised_picture_does_not_depend_on_where_the_log_is_cut(simulated:
 def test_process_applies_a_profiles_extensions_whatever_the_jobs(
     simulated: Simulated, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Stabiliser and start-up lag together: no frame is left out, the log says what is applied, bytes are the same."""
+    """Stabiliser and recorder lag together: no frame is left out, the log says what is applied, bytes are the same."""
     capture = simulated(effects=["stabilisation=0.7,0.8", "frame_lag=0.1,7"], frames=20)
     config = capture.folder / "truth" / "camera.yaml"
     written = []
@@ -234,5 +234,5 @@ def test_process_applies_a_profiles_extensions_whatever_the_jobs(
     assert written[0] == written[1]
     assert len(written[0]) == 20
     assert "stabiliser cancelling 0.7 above 0.8 Hz: followed" in caplog.text
-    assert "first 7 frames at their true times" in caplog.text
+    assert "first 7 frames are used at their true times" in caplog.text
     assert "not applied" not in caplog.text

@@ -33,7 +33,7 @@ def test_the_right_knots_are_better_on_every_frame(work: Path):
 
 def test_lamps_do_no_harm_where_they_are_known_to_be_clipped(work: Path):
     """3 % of the pixels several times too bright: 3 dB and more by the mask, near the lamps, elsewhere 1 dB."""
-    rows = {row["told"]: row for row in clipping_rows(work, "lamps", SEEDS, FRAMES)}
+    rows = {row["told"]: row for row in clipping_rows(work, "highlights", SEEDS, FRAMES)}
     assert 0.02 < rows["without"]["clipped"] < 0.05
     for part, least_db in (("near_db", 3.0), ("whole_db", 3.0), ("elsewhere_db", 1.0)):
         assert rows["with the mask"][part] - rows["without"][part] >= least_db

@@ -33,7 +33,7 @@ def test_a_capture_within_its_start_up_is_restored_at_its_true_times(virest, rea
     counts = result.account["counts"]
     assert counts["failed"] == 0
     assert counts["restored"] >= 22
-    assert any("frame lag" in warning for warning in result.account["warnings"])
+    assert any("recorder lag" in warning for warning in result.account["warnings"])
     assert result.account["profile"]["extensions"]["frame_lag"]["lag_s"] == pytest.approx(0.31, abs=0.05)
     assert "later content than their timestamps" in result.stderr
     assert_undamaged(result, realdata / "honor_v10")

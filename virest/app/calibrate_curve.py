@@ -80,7 +80,7 @@ def read_source(source: Path, exposures: Path | None) -> tuple[list[Still], list
 
 
 def as_json(fit: CurveFit, stills: list[Still], notes: list[str]) -> dict[str, Any]:
-    """The result in the form of contract section 1."""
+    """The result as a mapping, for ``--json``."""
     return {
         "response": _rounded(response_block(fit.curve)),
         "rms_grey_levels": fit.rms_grey_levels,
@@ -157,7 +157,7 @@ def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
     shape = "" if name == "table" else numbers.removeprefix("gamma ")
     lines = [
         f"{name} {shape}".strip(),
-        f"fit error {facts['rms_grey_levels']:.2f} grey levels rms, exposures {low:.4g} to {high:.4g} covered",
+        f"fit error {facts['rms_grey_levels']:.2f} grey levels rms over exposures {low:.4g} to {high:.4g}",
         f"the curve is known to ± {facts['curve_std_grey_levels']:.2f} grey levels there",
         table(["picture", "exposure_s", "error_ev", "contradicts", "likely_s"], rows),
     ]

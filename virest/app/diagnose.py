@@ -315,7 +315,7 @@ def draw_figures(
         rung = next((rung for rung in found.ladder if rung.has(cause.name)), None)
         own = f"{FIGURES}/{number:02d}_{cause.name}.png"
         if rung is not None:
-            drawings[own] = (ladder_figure, [_bars(rung)], f"{capture.name}: {cause.name}")
+            drawings[own] = (ladder_figure, [_bars(rung)], f"{capture.name}: candidates tried")
         drawn.append([own] if rung is not None else [])
     for number, field in enumerate(found.fields, start=1):
         if field.fields:

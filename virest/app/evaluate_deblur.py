@@ -393,7 +393,7 @@ def _leads(own: FrameResult, other: FrameResult) -> bool:
 
 
 def _text(facts: Mapping[str, Any]) -> str:
-    header = ["method", "MSE", "PSNR dB", "SSIM", "matches", "in place"]
+    header = ["method", "MSE", "PSNR dB", "SSIM", "matches", "correct"]
     parts = [
         f"CASE {facts['case'].replace(':', ',')}: {facts['frames']} frames, {facts['versions']}",
         "means over frames; PSNR of the mean MSE",
@@ -426,8 +426,10 @@ def _account(facts: Mapping[str, Any]) -> list[str]:
         lines.append(f"each picture aligned to its reference (by up to {far:.2f} px) and cropped to the overlap")
     lines.append(f"compared inside the valid area less a {facts['margin_px']} px border; matches: {facts['matching']}")
     if facts["baselines"]:
-        lines.append("baselines: true kernel of the frame centre, blended border, linear light unless noted, our warp, "
-                     "the best setting for each frame by MSE against truth")  # fmt: skip
+        lines.append(
+            "baselines: true kernel of the frame centre, blended border, linear light unless noted, the same warp, "
+            "the best setting for each frame by MSE against truth"
+        )
         lines += [f"{name}: {title}" for name, title in facts["baselines"].items()]
     lines += [f"{name}: skipped (library not installed)" for name in facts["left_out"]]
     for s in facts.get("simulated", []):

@@ -332,11 +332,11 @@ def _text(facts: dict[str, Any]) -> str:
         f"CASE A, rolling shutter: {facts['frames']} frames of {len(facts['captures'])} captures, {facts['versions']}",
         f"\nOne corner, as in the paper's Table 2: {example['corner']}, {example['capture']} frame {example['frame']}",
         _example_table(example),
-        "\nAngles between the board's outer corners (eq 29), |picture - truth| in degrees",
+        "\nAngles between the board's outer corners (eq 29), |frame - truth| in degrees",
         _angle_table(whole, "outer"),
         "\nThe same between neighbouring corners",
         _angle_table(whole, "neighbours"),
-        "\nPictures around the board against truth (PSNR of the mean MSE)",
+        "\nFrames around the board compared with truth (PSNR of the mean MSE)",
         _fidelity_table(whole),
     ]
     if len(facts["by_capture"]) > 1:
@@ -357,7 +357,7 @@ def _example_table(example: Mapping[str, Any]) -> str:
 def _angle_table(summary: Mapping[str, Any], key: str) -> str:
     rows = [[method, *_angle_cells(found[key])] for method, found in summary["methods"].items()]
     rows.append(["(detector on truth)", *_angle_cells(summary["detector_on_truth"][key])])
-    return _table(["method", "mean", "spread", "max", "relative %", "angles"], rows)
+    return _table(["method", "mean", "std", "max", "relative %", "angles"], rows)
 
 
 def _angle_cells(found: Mapping[str, Any]) -> list[str]:

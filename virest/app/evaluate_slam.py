@@ -334,7 +334,7 @@ def _closing(facts: dict[str, Any]) -> list[str]:
         )
     if removed:
         lines.append(
-            f"restored frames remove {100 * removed['median']:.1f} % (median; least {100 * removed['least']:.1f} %) "
+            f"restored frames remove {100 * removed['median']:.1f} % (median; minimum {100 * removed['least']:.1f} %) "
             "of the error that the rolling shutter adds"
         )
     lines.append(f"worse than recorded: {', '.join(worse) or 'none'}")

@@ -221,7 +221,7 @@ def _said(plan: ExportPlan) -> list[str]:
     kind = "restored by virest process" if plan.options.restored else "as recorded"
     return [
         f"{plan.capture.name}, pictures {kind}; profile from {Path(plan.source).name}",
-        f"a picture shows the instant {1e3 * plan.instant_s:.4f} ms after its timestamp",
+        f"a frame shows the instant {1e3 * plan.instant_s:.4f} ms after its timestamp",
         *(note.text for note in plan.notes if not note.on_stamps),
     ]
 

@@ -280,7 +280,7 @@ def _stamped(
         time_ns = capture.stamp_0_ns + round(frame.time_s * 1e9) if moved else frame.timestamp_ns
         time_ns += round(instant_s * 1e9) if options.stamps == "instant" else 0
         if found and time_ns <= found[-1].time_ns:
-            left_out["repeats a picture"] = left_out.get("repeats a picture", 0) + 1
+            left_out["repeats a frame"] = left_out.get("repeats a frame", 0) + 1
             continue
         exposure_s = None if pictures is not None else frame.exposure_s
         found.append(ExportFrame(frame.index, time_ns, exposure_s, pictures[frame.index] if pictures else None))
@@ -378,7 +378,7 @@ def _notes(
     shift_ms = 1e3 * float(np.median(instants_s))
     if options.stamps == "logged" and abs(shift_ms) > 1.0:
         text = (
-            f"a picture shows the instant {shift_ms:.1f} ms after its timestamp (timeshift_cam_imu); for tools without "
+            f"a frame shows the instant {shift_ms:.1f} ms after its timestamp (timeshift_cam_imu); for tools without "
             "a time shift, such as ORB-SLAM3, export with --stamps instant"
         )
         found.append(ExportNote(text, on_stamps=True))

@@ -20,6 +20,7 @@ from virest.app.pictures import compact
 from virest.app.simulate import simulate_command
 from virest.diagnosis.catalogue import CATALOGUE
 from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
+from virest.diagnosis.geometric_evidence import CAP
 from virest.diagnosis.ladder import diagnose_capture
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 11
@@ -52,10 +53,13 @@ CASES: dict[str, Case] = {
     "timestamp_reference": Case(
         "exposure_end", "like a time offset, but proportional to the exposure", (("exposure_ms", (4.0, 12.0)),)
     ),
-    "exposure_time": Case("1.5", "blur longer than predicted; tracked points hardly change"),
+    "exposure_time": Case(
+        "1.5",
+        "blur longer than predicted; points move as with a time offset of half the extra exposure, hence the rival",
+    ),
     "gyro_bias": Case("0.03,-0.02,0.025", "a constant shift from frame to frame, whatever the motion"),
     "gyro_scale": Case("1.03", "residuals proportional to the rotation rate; roll separates it from the focal length"),
-    "gyro_lowpass": Case("12", "like a time offset, but fast rotations are too small: the gyroscope's own low pass"),
+    "gyro_lowpass": Case("12", "like a time offset, but fast rotations are too small: the gyroscope's low-pass filter"),
     "imu_rotation": Case("0.02,-0.015,0.03", "residuals across the direction of motion"),
     "focal_length": Case("1.03", "residuals proportional to the rotation rate in pitch and yaw, not in roll"),
     "pixel_aspect": Case("1.02", "residuals that grow with the rotation rate in pitch, not in yaw or roll"),
@@ -64,16 +68,25 @@ CASES: dict[str, Case] = {
     "principal_point": Case("12,-9", "residuals under roll about the optical axis"),
     "stabilisation": Case("0.6,1.5", "the picture follows less of the fast motion than the gyroscope measures"),
     "scene_depth": Case("1.5", "residuals that follow the camera's travel, not its rotation", (("sway_m", 0.12),)),
-    "frame_lag": Case("0.2,20", "large residuals in the first frames only: the recorder's start-up"),
+    "frame_lag": Case(
+        "0.2,20",
+        "large residuals in the first frames only, while the recorder starts (the rms caps them, so it stays small)",
+    ),
     "response_curve": Case(
         "1.3", "brightness that disagrees in the mid-tones when exposure changes", (("auto_exposure_ev", 3.0),)
     ),
     "black_level": Case("0.04", "brightness that disagrees in the shadows", (("auto_exposure_ev", 3.0),)),
     "vignetting": Case("0.3", "points that darken towards the corners"),
-    "flicker": Case("0.15,100", "bright and dark bands across the rows, moving from frame to frame"),
+    "flicker": Case(
+        "0.15,100", "bright and dark bands across the rows, moving from frame to frame", (("exposure_ms", 3.0),)
+    ),
     "gain_drift": Case("0.03", "frames that are brighter or darker than exposure × ISO predicts"),
     "sharpening": Case("0.9,1.2", "overshoot beside edges: the phone sharpens; blur paths stay as predicted"),
-    "defocus": Case("1.6", "blur that is as strong along the motion as across it"),
+    "defocus": Case(
+        "2.5",
+        "blur that is as strong along the motion as across it",
+        (("scene", "board"), ("exposure_ms", 4.0), ("rate_rad_s", 0.5)),
+    ),
 }
 
 
@@ -100,9 +113,13 @@ HEAD = f"""<!-- Written by `make figures`; edit virest/app/gallery.py instead. -
 # Gallery: what each effect looks like
 
 Each capture below has one effect hidden in it by `virest simulate --effect`; `virest diagnose` reads the capture alone.
-Captures have {FRAMES} frames of {WIDTH}×{HEIGHT} (seed {SEED}). Grey curves show the residuals of the profile as
-given, blue curves those after the named causes are built in: medians and the middle 68 %. For effects that show in
-brightness or blur, bars show the held-out error that each candidate leaves; the red line is the error without any.
+Captures have {FRAMES} frames of {WIDTH}×{HEIGHT} (seed {SEED}).
+
+- **Curves** show residuals, medians and the central 68 %: grey with the profile as given, blue after the named causes
+  are built in. The legend gives the rms over all frames, the text that over held-out frames. As in all output of
+  `diagnose`, residuals above {CAP:g} times the typical one are capped, so that lost tracks do not dominate.
+- **Bars** show the error that each candidate leaves on the rung where the cause entered; the red line is the error
+  before that rung. For brightness these are errors of the fit, so they differ from the held-out errors in the text.
 
 """
 

@@ -234,7 +234,8 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = [("kind", facts["kind"])] if "kind" in facts else []
     if movie := facts.get("movie"):
         size = f"{movie['width']}x{movie['height']}"
-        rows.append(("movie", f"{size}, {movie['frames']} frames, {movie['keyframes']} key frames"))
+        keys = f"{movie['keyframes']} key frame{'s' if movie['keyframes'] != 1 else ''}"
+        rows.append(("movie", f"{size}, {movie['frames']} frames, {keys}"))
     rows += [("counts", text) for text in _wrapped(facts["counts"])]
     for name, reasons in facts["dropped"].items():
         rows.append(("dropped", f"{name}: " + ", ".join(f"{n} {reason}" for reason, n in reasons.items())))
@@ -259,7 +260,7 @@ def _camera_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows += [("imu gap", f"{start:.3f} to {end:.3f} s ({(end - start) * 1e3:.0f} ms)") for start, end in gaps[:8]]
     repeats = facts["repeats"]
     rows.append(("repeats", f"frames {', '.join(map(str, repeats))}" if repeats else "none in the first 2 s"))
-    rows.append(("start-up lag", f"{_shown(facts['startup_lag_s'], '.2f')} s" if facts["startup_lag_s"] else "none"))
+    rows.append(("recorder lag", f"{_shown(facts['startup_lag_s'], '.2f')} s" if facts["startup_lag_s"] else "none"))
     for run in facts["skipped"][:8]:
         rows.append(("left out", f"frames {run['first']}–{run['last']}: {run['reason']}"))
     exposure, iso = facts["exposure_s"], facts["iso"]

@@ -306,7 +306,7 @@ def _with_stalls_followed(job: Job, index: MovieIndex, plan: RestorationPlan) ->
         late_s = capture.frames[fit.shows[0]].time_s - capture.frames[fit.first].time_s
         text = (
             f"encoder stall corrected: frames {fit.first} to {fit.last}, up to {1e3 * late_s:.0f} ms later than "
-            f"stamped, are used at their true times (remaining error by points {1e3 * fit.rest_s[0]:+.1f} "
+            f"stamped, are used at their true times (remaining error from tracked points {1e3 * fit.rest_s[0]:+.1f} "
             f"± {1e3 * fit.rest_s[1]:.1f} ms)"
         )
         log.warning("%s: %s", job.name, text)

@@ -184,7 +184,7 @@ def read_folder(folder: Path, options: ReportOptions, among: int) -> CaptureReco
 
 
 def _read_run(folder: Path, options: ReportOptions, among: int) -> RunRecord:
-    account = read_model(folder / RUN, Account, "account of a run")
+    account = read_model(folder / RUN, Account, "run record")
     by_line, notes = read_frame_lines(folder, sum(account.counts.get(status, 0) for status in STATUSES))
     frames = list(by_line.values())
     chosen = choose_frames(frames, options.frames or max(1, min(FRAMES_SHOWN, MOST_FRAMES // among)))

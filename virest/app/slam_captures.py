@@ -131,7 +131,7 @@ DEVICES = (
 )  # fmt: skip
 """The same number as in Table 5 of Ye et al. 2026."""
 DEVICE_SOURCES = (
-    "[1] measured with a LED panel, [2] by panning past an edge: doc/rolling-shutter-table.md of JzHuai0108/kalibr",
+    "[1] measured with an LED panel, [2] by panning past an edge: doc/rolling-shutter-table.md of JzHuai0108/kalibr",
     "[3] logged by the phone, [4] measured from, or recorded in, a published capture",
 )
 

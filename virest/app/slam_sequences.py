@@ -178,7 +178,7 @@ def _seconds(sequences: SlamSequences) -> Array:
 
 def orb_slam_settings(profile: CameraProfile, fps: float) -> str:
     """Settings for ORB-SLAM3 without IMU, with the Camera entries of ORB-SLAM2 in addition to Camera1."""
-    text = format_orb_slam(profile, fps, None, ["pictures alone"], "evaluate slam")
+    text = format_orb_slam(profile, fps, None, ["frames only"], "evaluate slam")
     older = [line.replace("Camera1.", "Camera.") for line in text.splitlines() if line.startswith("Camera1.")]
     return text + "\n".join(older) + "\n"
 

@@ -38,7 +38,7 @@ DIFFERENCE_ORDER, DIFFERENCE_GAIN = 5, 252.0
 """Variance gain of the fifth difference for white noise: 1 + 25 + 100 + 100 + 25 + 1.  A tremor of 12 Hz sampled at
 200 Hz passes with 1/2000 of its amplitude; with a lower order as much of it would pass as there is noise."""
 NORMAL_MEDIAN = 0.6745
-WALK_COMMENT = "not measured, which takes hours at rest: a typical value of phones"
+WALK_COMMENT = "not measured (that takes hours at rest): typical for phones"
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +215,7 @@ def field_notes(profile: CameraProfile, off_px: float) -> list[str]:
 
 def _one_instant(profile: CameraProfile) -> list[str]:
     """Notes on pictures that are treated as instantaneous."""
-    notes = ["timeshift_cam_imu refers to a single instant of each picture, for tools without a rolling shutter"]
+    notes = ["timeshift_cam_imu refers to a single instant of each frame, for tools without a rolling-shutter model"]
     if profile.time_offset_s is None:
         notes = ["the time offset is unknown: no timeshift_cam_imu"]
     if profile.readout_known and profile.shutter.readout_time_s:

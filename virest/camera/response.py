@@ -174,7 +174,7 @@ def _inverse(curve: ResponseCurve, grey: NDArray[Any]) -> NDArray[Any]:
 
 def _require_curve(curve: ResponseCurve) -> None:
     def refuse(what: str) -> None:
-        raise SettingsError(f"response: {what}", hint="the curve must rise and be finite (forward_model, section 4)")
+        raise SettingsError(f"response: {what}", hint="the curve must rise and be finite")
 
     if curve.kind not in KINDS:
         refuse(f"kind '{curve.kind}' is not one of {', '.join(KINDS)}")

@@ -45,7 +45,7 @@ from virest.errors import CaptureError
 
 Reader = Callable[[Path, list[Note]], Source]
 HEAD_BYTES = 4096
-HINT = "pass a capture's folder: MARSLogger's, EuRoC's, pictures with stamps, a movie with a .gcsv or telemetry inside"
+HINT = "pass a capture folder: MARSLogger, EuRoC, images with timestamps, or a movie with .gcsv or embedded telemetry"
 
 
 def read_source(folder: Path, notes: list[Note]) -> Source:

@@ -76,7 +76,7 @@ class _Joined:
 def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
     """Read, join and check a capture folder.
 
-    ``look_at_pictures``: decode the first two seconds to find repeated pictures (start-up lag).
+    ``look_at_pictures``: decode the first two seconds to find repeated pictures (recorder lag).
     Raises VideoError, ImuError, ClockError or CaptureError if the capture cannot be used; a partly usable capture is
     returned with notes, counts and a reason on each skipped frame.
     """

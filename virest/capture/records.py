@@ -40,7 +40,7 @@ class Frame:
 
     @property
     def only_startup(self) -> bool:
-        """Whether the start-up lag is the only reason to skip the frame, which diagnosis and calibration then use."""
+        """Whether the recorder lag is the only reason to skip the frame, which diagnosis and calibration then use."""
         return self.skip_codes == (STARTUP,)
 
 

@@ -74,7 +74,7 @@ class Bag:
             self._reader.open()
         except Exception as error:
             raise CaptureError(
-                f"{label(self.path)}: cannot be read as a bag: {error}", hint="is the copy whole?"
+                f"{label(self.path)}: cannot be read as a bag: {error}", hint="is the copy complete?"
             ) from error
         return self
 

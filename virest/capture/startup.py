@@ -41,7 +41,7 @@ SETTLED_FRAMES = 10
 
 @dataclass(frozen=True, slots=True)
 class Startup:
-    """Evidence of the start-up lag."""
+    """Evidence of the recorder lag."""
 
     frames: int = 0
     """Number of leading frames whose content is, or may be, later than their timestamps."""

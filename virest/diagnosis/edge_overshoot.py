@@ -123,13 +123,13 @@ def judge_sharpening(
     seen = look_for_steps(gray, capture, each) if steps is None else steps
     found = fit_sharpening(edge_profiles(seen, profile, trajectory)) if len(seen) else None
     if found is None:
-        verdict.notes.append("too few sharp, isolated edges: sharpening was not judged")
+        verdict.notes.append("too few sharp, isolated edges: sharpening was not tested")
     elif EDGE_LEVELS.significant(found.p_value):
         values = {"amount": (found.amount, found.amount_std), "radius_px": (found.radius_px, found.radius_std_px)}
         changes = {name: ParameterChange(0.0, value, std) for name, (value, std) in values.items()}
         sentence = (
-            f"edges overshoot by {found.overshoot:.0%} of their step: the phone sharpened its pictures by an unsharp "
-            f"mask of {found.amount:.2g} with a radius of {found.radius_px:.2g} px"
+            f"edges overshoot by {found.overshoot:.0%} of their step: the phone sharpened its frames with an unsharp "
+            f"mask (amount {found.amount:.2g}, radius {found.radius_px:.2g} px)"
         )
         verdict.findings.append(Finding("sharpening", changes, found.held_out, (), found.p_value, sentence))
         verdict.rungs.append(Rung("sharpening", {"sharpening": found.held_out.after}, found.held_out.before, EDGES))

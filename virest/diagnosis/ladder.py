@@ -225,9 +225,7 @@ class DiagnosisSession:
         exposure_s = self.points.observed.exposure_s
         scale, is_exposure = exposure_hypothesis(self.findings, exposure_s), False
         if points_left(self.geometric).significant:
-            self.notes.append(
-                "tracked points disagree with the model: blur and its effect on the curve were not judged"
-            )
+            self.notes.append("tracked points disagree with the model: blur and the exposure curve were not tested")
         else:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
             shown = replace(self.capture, frames=self._all_frames())
@@ -253,7 +251,7 @@ class DiagnosisSession:
         if _paths_uncertain(extended, self.geometric):
             if self.light.observations is None or not light_varies(self.light.observations):
                 self.curve.notes.append(
-                    "blur depends on more than rotation: the curve was not judged at constant exposure"
+                    "blur depends on more than rotation: the exposure curve could not be tested at constant exposure"
                 )
             return
         trajectory = integrate_gyro(self.capture.imu, extended)

@@ -149,18 +149,18 @@ def climb_photometry(
     """Find what changes the brightness of patches; the frames have their true timestamps."""
     verdict = PictureVerdict(profile)
     if not frames:
-        verdict.notes.append("no frame at a known time: brightness not judged")
+        verdict.notes.append("no frame at a known time: brightness was not tested")
         return verdict
     if all(frame.exposure_s is None for frame in frames):
         verdict.notes.append(
-            "exposures unknown: brightness changes between frames cannot be attributed and were not judged"
+            "exposures unknown: brightness changes between frames cannot be attributed and were not tested"
         )
         return verdict
     by_index = {frame.index: frame for frame in frames}
     pictures = ((by_index[k], picture) for k, picture in rgb([frame.index for frame in frames]))
     observations = observe_photometry(pictures, trajectory, profile, intra_frames=capture.keyframes)
     if len(observations) < MIN_OBSERVATIONS:
-        verdict.notes.append("too few flat patches are seen again: brightness not judged")
+        verdict.notes.append("too few flat patches are seen again: brightness was not tested")
     else:
         climb_observations(verdict, observations, len(capture.frames), each)
     return verdict
@@ -337,7 +337,9 @@ def name_curve(verdict: PictureVerdict, evidence: MixingEvidence) -> None:
     tried = {name: _mixed(evidence, verdict.profile, name) for name in evidence.steps}
     found = verdict.mixed = {name: one for name, one in tried.items() if one}
     if not found:
-        verdict.notes.append("no blurred frames beside sharp ones: the curve was not judged at constant exposure")
+        verdict.notes.append(
+            "no blurred frames beside sharp ones: the exposure curve could not be tested at constant exposure"
+        )
         return
     log.debug("mixing: %s", found)
     supported = {name: one for name, one in found.items() if _is_supported(one, name, verdict.profile)}
@@ -384,7 +386,7 @@ def climb_blur(
     """
     verdict = PictureVerdict(profile)
     if not local_blur.frames_to_read(capture):
-        verdict.notes.append("no two frames with known exposures to compare: blur not judged")
+        verdict.notes.append("no two frames with known exposures to compare: blur was not tested")
         return verdict, False
     observations = local_blur.look_for_blur(gray, capture, profile, trajectory, each)
     verdict.steps = observations.steps

@@ -348,7 +348,7 @@ _POINTS = (
         "the first {frames} frames show content up to {lag_s} s later than their timestamps",
         applied=_applied(
             "frame_lag_frames",
-            "frame lag of {e.frame_lag_s:g} s at the start: first {e.frame_lag_frames} frames at their true times",
+            "recorder lag of {e.frame_lag_s:g} s: the first {e.frame_lag_frames} frames are used at their true times",
         ),
     ),
 )
@@ -421,8 +421,8 @@ _LIGHT = (
         EDGES,
         (*_value("amount", lambda p: 0.0, _none), *_value("radius_px", lambda p: 0.0, _none)),
         "",
-        "the phone sharpened its pictures",
-        "the phone sharpened its pictures by an unsharp mask of {amount} with a radius of {radius_px} px",
+        "the phone sharpened its frames",
+        "the phone sharpened its frames with an unsharp mask (amount {amount}, radius {radius_px} px)",
     ),
 )
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Picture = NDArray[np.uint8]
 RATIO = 0.75
 IN_PLACE_PX = 2.0
-METHOD = f"SIFT (OpenCV's defaults), brute force L2, ratio {RATIO:g}; in place: within {IN_PLACE_PX:g} px"
+METHOD = f"SIFT (OpenCV's defaults), brute force L2, ratio {RATIO:g}; correct: within {IN_PLACE_PX:g} px"
 
 
 @dataclass(frozen=True, slots=True)

@@ -166,9 +166,9 @@ def _draw_residuals(axes: Any, along: str, sets: Mapping[str, Mapping[str, Any] 
         middle = [float(np.median(covariate[share])) for share in shares]
         rms = [float(np.sqrt(np.mean(x[share] ** 2 + y[share] ** 2) / 2)) for share in shares]
         axes.plot(middle, rms, marker=".", lw=1.6, color=colours[label], label=label)
+    axes.set_ylim(0, 1.18 * axes.get_ylim()[1])
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="best", fontsize=8)
-    axes.set_ylim(bottom=0)
+        axes.legend(loc="upper right", ncols=2, fontsize=8)
     axes.set_xlabel(RESIDUAL_AXES[along])
     axes.set_ylabel("rms of tracked − predicted points, px")
     axes.set_title("residuals of the whole model, before and after", fontsize=10)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.calibration.response_curve import CurveFit
+from virest.effects.records import PHOTOMETRY
 
 FORMATS = ("png", "svg", "pdf")
 MAX_POINTS = 12_000
@@ -20,6 +21,8 @@ COVARIATES = {"row": "fraction of the readout", "time": "time, s", "radius": "ra
 """Covariates of residual plots, with axis labels."""
 RESIDUALS = ("x_px", "y_px")
 BINS, MIN_IN_BIN = 24, 8
+LEAST_BARS = 3
+"""A rung with fewer candidates is drawn with room for this many."""
 MOST_DEVIATIONS, DEVIATION_BARS = 4.0, 16
 
 Array = NDArray[np.float64]
@@ -133,22 +136,29 @@ def residual_figure(
 ) -> bytes:
     """Residuals along x and y over row, time, radius and rate: medians in bins of equal count, and the central 68 %.
 
-    before, after: covariate name → (n,), and ``x_px``, ``y_px`` (n,).
+    before, after: covariate name → (n,), and ``x_px``, ``y_px`` (n,).  The legend gives the rms as `diagnose` prints
+    it: per coordinate, with large residuals capped.
     """
     names = [name for name in COVARIATES if name in before or name in after]
+    sets = (("before", "0.45", before), ("after", "steelblue", after))
     figure = canvas(3.4 * max(len(names), 1), 5.6)
     axes = figure.subplots(2, max(len(names), 1), squeeze=False, sharey="row")
     for line, component in zip(axes, RESIDUALS, strict=True):
         for place, name in zip(line, names, strict=False):
-            for label, colour, data in (("before", "0.45", before), ("after", "steelblue", after)):
+            for _, colour, data in sets:
                 if name in data and component in data:
-                    _draw_binned(place, np.asarray(data[name]), np.asarray(data[component]), label, colour)
+                    _draw_binned(place, np.asarray(data[name]), np.asarray(data[component]), colour)
             place.axhline(0, color="0.7", lw=0.8, zorder=0)
             place.set_xlabel(COVARIATES[name])
         line[0].set_ylabel(f"residual along {component[0]}, px")
-    if axes[0][0].get_legend_handles_labels()[0]:
-        axes[0][0].legend(loc="upper right", fontsize=8)
+    for label, colour, data in sets:
+        if all(len(data.get(component, ())) for component in RESIDUALS):
+            text = f"{label}: rms {_printed_rms(*(data[component] for component in RESIDUALS)):.3g} px"
+            axes[0][0].plot([], [], color=colour, lw=1.6, marker=".", label=text)
     figure.suptitle(literal(title))
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     return as_file(figure, image_format)
 
 
@@ -169,7 +179,7 @@ def deviation_figure(ratios: Mapping[str, Sequence[float]], title: str = "", ima
         inside = np.clip(np.asarray(values, float), edges[0] + 1e-9, edges[-1] - 1e-9)
         place.hist(inside, edges, density=True, color="steelblue")
         place.plot(along, np.exp(-(along**2) / 2) / np.sqrt(2 * np.pi), color="0.3", lw=1.2)
-        place.set_title(literal(f"{name}: {len(inside)}"), fontsize=9)
+        place.set_title(literal(f"{name}: {len(inside)} errors"), fontsize=9)
         place.set_yticks([])
     figure.supxlabel("error / standard deviation")
     figure.suptitle(literal(title))
@@ -181,30 +191,41 @@ def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str 
 
     rungs: (quantity, before, {name: after}, entered or None).
     """
-    figure = canvas(4.2 * max(len(rungs), 1), 0.9 + 0.26 * max([8, *(len(tried) for _, _, tried, _ in rungs)]))
+    most = max([LEAST_BARS, *(len(tried) for _, _, tried, _ in rungs)])
+    figure = canvas(4.2 * max(len(rungs), 1), 1.3 + 0.26 * most)
     axes = figure.subplots(1, max(len(rungs), 1), squeeze=False)[0]
     for number, (place, rung) in enumerate(zip(axes, rungs, strict=False), start=1):
-        _draw_rung(place, number, rung)
+        entered = rung[3] or "no candidate gains enough"
+        name = f"{number}. {entered}" if len(rungs) > 1 else "" if rung[3] else entered
+        _draw_rung(place, rung, most, name)
     figure.suptitle(literal(title))
     return as_file(figure, image_format)
 
 
-def _draw_rung(axes: Any, number: int, rung: RungBars) -> None:
+def _draw_rung(axes: Any, rung: RungBars, most: int, name: str) -> None:
+    """Bars of one rung, as thick as if there were ``most`` of them; the error before stands above its line.
+
+    Brightness is mostly judged by the fit itself, everything else on held-out frames.
+    """
     quantity, before, tried, entered = rung
     known = sorted((after, name) for name, after in tried.items() if np.isfinite(after))
     names = [name for _, name in known]
     colours = ["steelblue" if name == entered else "0.75" for name in names]
     axes.barh(range(len(names)), [after for after, _ in known], color=colours)
     axes.set_yticks(range(len(names)), [literal(name) for name in names], fontsize=8)
-    axes.invert_yaxis()
+    axes.set_ylim(most - 0.5, -0.5)
     if np.isfinite(before):
-        axes.axvline(before, color="crimson", lw=1.2, label=f"before: {before:.3g}")
-        axes.legend(loc="lower right", fontsize=8)
-    axes.set_xlabel(f"{literal(quantity)}, held-out frames")
-    axes.set_title(literal(f"{number}. {entered or 'no candidate gains enough'}"), fontsize=10)
+        axes.axvline(before, color="crimson", lw=1.2)
+        side = "right" if before > 0.5 * axes.get_xlim()[1] else "left"
+        axes.annotate(f"before: {before:.3g}", (before, 1), xycoords=("data", "axes fraction"), xytext=(0, 3),
+                      textcoords="offset points", ha=side, color="crimson", fontsize=8)  # fmt: skip
+    held_out = "" if quantity == PHOTOMETRY else ", held-out frames"
+    axes.set_xlabel(literal(quantity) + held_out)
+    if name:
+        axes.set_title(literal(name), fontsize=10, pad=18)
 
 
-def _draw_binned(axes: Any, along: Array, residual: Array, label: str, colour: str) -> None:
+def _draw_binned(axes: Any, along: Array, residual: Array, colour: str) -> None:
     known = np.isfinite(along) & np.isfinite(residual)
     along, residual = along[known], residual[known]
     if len(along) < MIN_IN_BIN:
@@ -214,11 +235,16 @@ def _draw_binned(axes: Any, along: Array, residual: Array, label: str, colour: s
     middle = [float(np.median(along[share])) for share in shares]
     low, centre, high = (np.array([np.percentile(residual[share], q) for share in shares]) for q in (16, 50, 84))
     axes.fill_between(middle, low, high, color=colour, alpha=0.2, lw=0)
-    axes.plot(middle, centre, color=colour, lw=1.6, marker=".", label=f"{label}: rms {_rms(residual):.3g} px")
+    axes.plot(middle, centre, color=colour, lw=1.6, marker=".")
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+def _printed_rms(x_px: Any, y_px: Any) -> float:
+    """Capped rms per coordinate, as for ``geometry_rms_px``; NaN where no residual is finite."""
+    from virest.diagnosis.geometric_evidence import capped_rms
+
+    distance = np.hypot(np.asarray(x_px, float), np.asarray(y_px, float))
+    known = distance[np.isfinite(distance)]
+    return capped_rms(known) if len(known) else float("nan")
 
 
 def _luma(picture: Picture) -> Array:

@@ -47,7 +47,7 @@ STATE_WORDS = {
     "skipped": "skipped",
     "failed": "failed",
     "straightened": "straightened, not deblurred",
-    "remark": "restored, with a remark",
+    "remark": "restored, with a warning",
 }
 LEFT_ALONE = ("failed", "skipped", "copied", "straightened", "remark")
 """States listed in the table of reasons, in this order."""

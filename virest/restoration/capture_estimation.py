@@ -380,7 +380,7 @@ def _default_notes(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, 
     """A note for each unknown value, which is set to its documented default."""
     notes = []
     if profile.response is None:
-        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "response curve unknown: srgb assumed"))
+        notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "exposure curve unknown: srgb assumed"))
     if not profile.readout_known:
         notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "readout time unknown: 0 assumed, rows are not straightened"))
     if all(frame.exposure_s is None for frame in capture.frames):

@@ -44,7 +44,7 @@ def at_lag(capture: Capture, profile: CameraProfile, lag: StartUpLag) -> Capture
 def with_lag(plan: RestorationPlan, lag: StartUpLag) -> RestorationPlan:
     """A plan that was made at true times, with the lag added to its profiles and notes."""
     contradicted = None if plan.contradicted is None else _profile_with_lag(plan.contradicted, lag)
-    text = f"frame lag of {lag.lag_s:.2f} s at the start: the first {lag.frames} frames are used at their true times"
+    text = f"recorder lag of {lag.lag_s:.2f} s: the first {lag.frames} frames are used at their true times"
     profile = _profile_with_lag(plan.profile, lag)
     return replace(plan, profile=profile, contradicted=contradicted).noted(NoteCode.TRUE_TIMES, text)
 

@@ -375,7 +375,7 @@ def shown_captures(true: CameraProfile, settings: SessionSettings) -> NDArray[np
         return slots
     if lag > last:
         raise SettingsError(
-            f"a frame lag of {lag} frames cannot be used up in {last} slots", hint="give more slots or a smaller lag"
+            f"a recorder lag of {lag} frames cannot be used up in {last} slots", hint="give more slots or a smaller lag"
         )
     repeats = np.round(np.arange(1, lag + 1) * last / lag).astype(int)
     return slots + lag - np.searchsorted(repeats, slots, side="right")

@@ -3,10 +3,10 @@
 Each seed draws the hidden values and the conditions: motion, translation, blur, exposures, noise, bit rate, scene,
 lens, orientation.  Seeds below FIRST_SEED are reserved for choosing constants.
 
-For each value the table shows the median |error| / σ (0.67 if σ is right), the fraction of errors within 2 σ (0.95),
-the mean error / σ (0 without bias) and a histogram.  "share" is the fraction of a step's noise that is correlated with
-the value's own pattern: as implied by these captures (the fraction for which the median would be 0.67), and as in
-:data:`virest.inference.tracking_bias.STILL_SHARED`.
+For each value the table shows median |error| / deviation (0.67 where deviations hold), the fraction of errors within
+two deviations (0.95), the mean error in deviations, which a bias moves from 0, and a histogram.  "share" is the
+fraction of a step's noise that is correlated with the value's own pattern: the one that these errors imply (with it
+the median would be 0.67) and the one that :data:`virest.inference.tracking_bias.STILL_SHARED` uses.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def calibration_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     rows = [row for k in range(seeds) for row in calibrated_rows(work, FIRST_SEED + k)]
     names = list(dict.fromkeys(row["value"] for row in rows))
     summary = {name: summed([row for row in rows if row["value"] == name]) for name in names}
-    header = ["value", "errors", "median |e|/σ", "within 2σ", "mean e/σ", "share asked", "in use",
+    header = ["value", "errors", "median |e|/σ", "within 2σ", "mean e/σ", "share implied", "share used",
               "e/σ below -3, -2, -1, 0, 1, 2, 3, above"]  # fmt: skip
     text = table(header, [_shown(name, one) for name, one in summary.items()])
     if scale.figures is not None:

@@ -112,5 +112,7 @@ def commands_text(rows: list[Facts]) -> str:
         others = f"{row['others_cores']:.1f}"
         found = [f"{row['wall_s']:.2f}", f"{row['cpu_s']:.2f}", f"{row['part_of_asked']:.2f}", others]
         lines.append([row["title"], f"{row['asked_s']:g}", *found])
-    header = ["command", "asked s", "wall s", "CPU s", "wall / asked", "others' cores"]
-    return "COMMANDS: from start to end; calibrate and diagnose against the capture's length\n" + table(header, lines)
+    header = ["command", "target s", "wall s", "CPU s", "wall / target", "others' cores"]
+    return "COMMANDS: from start to exit; the target of calibrate and diagnose is the capture's length\n" + table(
+        header, lines
+    )

@@ -145,7 +145,7 @@ def masked_psnr_db(picture: Picture | None, truth: Picture, mask: Mask) -> float
 # ── clipped light ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-CLIPPING = ("sunlit", "lamps")
+CLIPPING = ("sunlit", "highlights")
 """Leaves exposed so that CLIPPED_SHARE of the pixels clip; leaves with highlights of up to 12 times the clip level on
 about 3 % of the area."""
 CLIPPED_SHARE = 0.03
@@ -177,8 +177,8 @@ def _clipping_pair(work: Path, name: str, seed: int, frames: int) -> tuple[Path,
     """
     options = {"response": GAMMA, "seed": seed, "frames": frames}
     less = _capture(work, f"less-{seed}", **options)
-    if name == "lamps":
-        return _capture(work, f"lamps-{seed}", scene="bright", **options), less, 1.0
+    if name == "highlights":
+        return _capture(work, f"highlights-{seed}", scene="bright", **options), less, 1.0
     light = np.stack([GAMMA.linearise(truth_frame(less, k) / 255).max(axis=2) for k in range(frames)])
     gain = float(1 / np.quantile(light, 1 - CLIPPED_SHARE))
     drift = "gain_drift=" + ",".join([f"{gain:.6f}"] * frames)
@@ -212,7 +212,7 @@ def _near_and_far(results: list[RestoredFrame], clipped: Path) -> list[list[floa
 
 
 def _curves_text(rows: list[dict[str, Any]]) -> str:
-    head = ["camera's curve", "used", "PSNR", "gain", "right is better by", "least"]
+    head = ["camera's curve", "used", "PSNR", "gain", "right curve better by", "min"]
     cells = [
         [row["camera"], row["told"], f"{row['psnr_db']:.2f}", f"{row['gain_db']:+.2f}",
          f"{row['right_minus_this_db']:+.2f}", f"{row['least_right_minus_this_db']:+.2f}"]
@@ -221,7 +221,7 @@ def _curves_text(rows: list[dict[str, Any]]) -> str:
     toe, shoulder = rows[-1]["toe_and_shoulder"]
     return (
         "CURVES: mean PSNR in dB against truth, gain over straightening alone, and what the right curve adds\n"
-        f"(preset balanced; toe and shoulder hold {toe:.0%} and {shoulder:.0%} of the pixels; least: of any frame)\n"
+        f"(preset balanced; toe and shoulder hold {toe:.0%} and {shoulder:.0%} of the pixels; min: over all frames)\n"
         + table(head, cells)
     )
 

@@ -420,12 +420,12 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         "false_alarms": sum(bool(row["fields"]) for row in rows if row["hidden"] not in EFFECTS),
         "nulls": len(rows) - len(hidden),
     }
-    header = ["hidden", "seed", "size", "verdict", "causes", "fields", "gain", "elsewhere", "pictures dB",
+    header = ["hidden", "seed", "size", "verdict", "causes", "fields", "gain", "elsewhere", "frames dB",
               "rms / noise px", "CPU s"]  # fmt: skip
     text = table(header, [shown(row) for row in rows])
     text += (
         f"\n{summary['right']} of {summary['captures']} right; {summary['solved_elsewhere']} of "
-        f"{summary['of_elsewhere']} solved on another capture; pictures better in {summary['pictures_better']} of "
+        f"{summary['of_elsewhere']} solved on another capture; frames better in {summary['pictures_better']} of "
         f"{summary['of_pictures']}, a frame worse in {summary['pictures_worse']}; {summary['false_alarms']} false "
         f"alarms in {summary['nulls']} captures without an unknown effect"
     )

@@ -234,8 +234,8 @@ def _text(promise: Row, best: dict[str, Row], swept: dict[str, tuple[Sequence[fl
         for name, (values, gains) in swept.items()
     ]
     return (
-        f"FITS: {promise['frames']} frames of {promise['captures']} captures with separate seeds; |promise-gain|\n"
-        f"{promise['off_db']:.2f} dB in the median with what fits best\n"
+        f"FITS: {promise['frames']} frames of {promise['captures']} captures with separate seeds\n"
+        f"median |predicted - measured gain| of the best fit: {promise['off_db']:.2f} dB\n"
         + table(header, lines)
         + "\n"
         + "\n".join(curves)

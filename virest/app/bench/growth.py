@@ -140,13 +140,13 @@ def growth_text(facts: Facts) -> str:
     tiled = [[str(r["tile_px"]), f"{r['tiles']:.0f}", _ms(r["cpu_s_per_frame"]), _ms(r["deblur_cpu_s"])]
              for r in tiles["rows"]]  # fmt: skip
     return (
-        f"GROWTH: preset {facts['preset']}; ms a frame without start and planning; time grows as size^p\n"
-        f"frames: p = {exponent_text(frames)} (1: a frame takes the same however long the movie)\n"
-        + table(["frames", "wall s", "CPU s", "ms a frame more", "CPU ms a frame more"], counted)
+        f"GROWTH: preset {facts['preset']}; ms per frame without start-up and planning; time grows as size^p\n"
+        f"frames: p = {exponent_text(frames)} (1: the time per frame does not depend on the movie's length)\n"
+        + table(["frames", "wall s", "CPU s", "ms per added frame", "CPU ms per added frame"], counted)
         + f"\n\npixels: p = {exponent_text(pixels)} of the CPU time; blur paths grow with the picture's side\n"
-        + table(["size", "pixels", "ms a frame", "CPU ms"], sized)
-        + f"\n\ntiles: p = {exponent_text(tiles)} of the CPU time of deblurring; tiles as asked for by tile_px\n"
-        + table(["tile_px", "tiles", "CPU ms a frame", "of it deblurring"], tiled)
+        + table(["size", "pixels", "ms per frame", "CPU ms"], sized)
+        + f"\n\ntiles: p = {exponent_text(tiles)} of the CPU time of deblurring; tiles by tile_px\n"
+        + table(["tile_px", "tiles", "CPU ms per frame", "deblurring"], tiled)
     )
 
 

@@ -20,9 +20,9 @@ from virest.evaluation.fidelity import psnr_db
 Row = dict[str, Any]
 WORSE_DB = 0.1
 """A frame that loses more than this counts as made worse."""
-OBEDIENT, DEFOCUSED, PHONE = "obedient", "defocused", "phone"
+NOMINAL, DEFOCUSED, PHONE = "nominal", "defocused", "phone"
 """Sets of captures: conforming to the camera model; with defocus in the profile; with a phone's own processing."""
-SETS = (OBEDIENT, DEFOCUSED, PHONE)
+SETS = (NOMINAL, DEFOCUSED, PHONE)
 
 
 def honesty_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
@@ -69,7 +69,7 @@ def summarise_honesty(rows: Sequence[Row]) -> list[Row]:
 
 def frames_text(rows: Sequence[Row], presets: Sequence[str]) -> str:
     """One line per frame of one capture: predicted and measured gain of each preset."""
-    header = ["capture", "frame", "blur px", "straight dB", *(f"{p}: promise / gain" for p in presets)]
+    header = ["capture", "frame", "blur px", "straight dB", *(f"{p}: predicted / measured gain" for p in presets)]
     lines: dict[int, list[str]] = {}
     for row in rows:
         start = [row["capture"], str(row["frame"]), f"{row['blur_px']:.1f}", f"{row['straightened_db']:.2f}"]
@@ -82,11 +82,12 @@ def frames_text(rows: Sequence[Row], presets: Sequence[str]) -> str:
 def honesty_text(summary: Sequence[Row]) -> str:
     """Table of all captures, followed by the sets in capitals."""
     header = ["capture", "preset", "frames", "deblurred", "mean gain", "worse", "their mean", "worst",
-              "promised", "|promise-gain|", "promised, worse"]  # fmt: skip
+              "predicted", "|error|", "predicted, worse"]  # fmt: skip
     lines = [_summary_cells(entry) for entry in summary]
     return (
         f"HONESTY: gain in dB over straightening alone; worse: frames that lose more than {WORSE_DB} dB\n"
-        "(promised: frames with an expected_gain_db; |promise-gain|: their median)\n" + table(header, lines)
+        "(predicted: frames with an expected_gain_db; |error|: median of their |predicted - measured gain|)\n"
+        + table(header, lines)
     )
 
 
@@ -97,7 +98,7 @@ def _row(workload: Workload, preset: str, line: Row, before_db: float, after_db:
     deblur = line["deblur"]
     done = deblur["method"] != "none"
     return {
-        "set": workload.kind if workload.kind in (DEFOCUSED, PHONE) else OBEDIENT,
+        "set": workload.kind if workload.kind in (DEFOCUSED, PHONE) else NOMINAL,
         "capture": workload.name,
         "preset": preset,
         "frame": line["frame"],

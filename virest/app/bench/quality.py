@@ -31,7 +31,7 @@ KIND_TITLES = {
     "fine": "the same at 1 bit/px",
     "long": "long blur, strong noise: 15-45 px",
     "bright": "bright clipped areas: 5-20 px",
-    "shaken": "shaken: 5-45 px, near plane, noise, lamps",
+    "shaken": "shaken: 5-45 px, near plane, noise, highlights",
     "phone": "as phones film, nominal profile",
 }
 
@@ -123,7 +123,7 @@ def _text(summary: list[dict[str, Any]]) -> str:
         "(over the frames whose blur is in range; peers: true centre kernel, linear light,\n"
         " blended border, same warp, best setting for each frame by PSNR against truth)\n"
         + table(["capture", "frames", "straight dB", *(SHORT.get(method, method) for method in METHODS)], means)
-        + "\n\nthe same of the worst frame, whatever its blur\n"
+        + "\n\nthe same for the worst frame, at any blur\n"
         + table(["capture", "of", *PRESETS], minima)
     )
 

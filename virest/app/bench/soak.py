@@ -204,4 +204,4 @@ def _text(facts: dict[str, Any]) -> str:
     ]
     title = f"SOAK: {facts['captures']} captures in one run, {facts['seconds']:.0f} s; second quarter -> last quarter\n"
     explanations = "\n".join(f"  {defect}: {line[:150]}" for defect, line in facts["explanations"].items())
-    return title + table(["what", "found", "wanted"], rows) + "\n" + explanations
+    return title + table(["what", "found", "expected"], rows) + "\n" + explanations

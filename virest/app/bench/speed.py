@@ -249,7 +249,7 @@ def _peers_text(facts: Facts) -> str:
         rows.append([name, f"{1000 * seconds:.0f}", *("-" if r is None else f"{r:.1f}" for r in ratios)])
     rows += [[name, why, *("-" for _ in presets)] for name, why in facts["peers_missing"].items()]
     return (
-        "PEERS: one colour frame deblurred on one core, CPU ms; then how many times the deblur stage's\n"
+        "PEERS: one colour frame deblurred on one core, CPU ms; then as a multiple of the deblur stage's\n"
         "(scikit-image and deepinv with one kernel for the whole frame)\n"
         + table(["peer", "ms", *(f"/ {entry['preset']}" for entry in presets)], rows)
     )

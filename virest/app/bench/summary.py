@@ -14,7 +14,7 @@ from virest.app.bench.tables import table
 Report = dict[str, Any]
 LEAST_FLOOR_SHARE, LEAST_SCALING, MOST_ESTIMATION = 0.6, 1.8, 0.05
 LEAST_PHONE_GAIN_DB = {"fast": 1.2, "balanced": 1.6, "best": 1.8}
-MOST_PROMISE_OFF_DB = 0.5
+MOST_PREDICTION_OFF_DB = 0.5
 LEAST_RATE = {"balanced": 8.0, "best": 0.3}
 MOST_WORKER_MB, MOST_GROWTH = 400.0, 1.05
 MOST_EXPONENT = 1.1
@@ -30,7 +30,7 @@ class Row:
     """One figure with its target."""
 
     figure: str
-    asked: str
+    target: str
     measured: str
     met: str = OPEN
 
@@ -61,7 +61,7 @@ def summary_text(report: Report) -> str:
         return ""
     versions = report.get("versions", {})
     load = f"{versions.get('cores')} cores, load {versions.get('load', 0.0):.1f} at the start"
-    body = table(["figure", "asked", "measured", "met"], [[r.figure, r.asked, r.measured, r.met] for r in rows])
+    body = table(["figure", "target", "measured", "met"], [[r.figure, r.target, r.measured, r.met] for r in rows])
     return f"SUMMARY: virest {versions.get('virest')}, scale {report.get('scale')}, {load}\n" + body
 
 
@@ -168,12 +168,12 @@ def _command_rows(commands: Report) -> list[Row]:
 
 
 def _command_row(row: Report) -> Row:
-    asked = f"< {row['asked_s']:g} s"
+    target = f"< {row['asked_s']:g} s"
     if row["exit_code"]:
-        return Row(row["title"], asked, f"exit code {row['exit_code']}", NO)
+        return Row(row["title"], target, f"exit code {row['exit_code']}", NO)
     measured = f"{row['wall_s']:.2f} s (CPU {row['cpu_s']:.2f})"
     met = judge(row["part_of_asked"] < 1.0, row["cpu_part_of_asked"] < 1.0, row["others_cores"])
-    return Row(row["title"], asked, measured, met)
+    return Row(row["title"], target, measured, met)
 
 
 def _honesty_rows(honesty: Report) -> list[Row]:
@@ -184,13 +184,15 @@ def _honesty_rows(honesty: Report) -> list[Row]:
             continue
         title, least = f"{entry['set']}, {entry['preset']}", LEAST_PHONE_GAIN_DB[entry["preset"]]
         gain, worse, off = (entry[key] for key in ("mean_gain_db", "worse_share", "promise_off"))
-        asked, met = (f">= {least:g} dB", YES if gain >= least else NO) if entry["set"] == "phone" else (OPEN, OPEN)
-        rows.append(Row(f"{title}: mean gain", asked, f"{gain:+.2f} dB", met))
+        target, met = (f">= {least:g} dB", YES if gain >= least else NO) if entry["set"] == "phone" else (OPEN, OPEN)
+        rows.append(Row(f"{title}: mean gain", target, f"{gain:+.2f} dB", met))
         rows.append(Row(f"{title}: frames made worse", "none", f"{percent(worse)}, worst {entry['worst_db']:+.2f} dB",
                         NO if worse else YES))  # fmt: skip
         if off is not None:
-            met = YES if off <= MOST_PROMISE_OFF_DB else NO
-            rows.append(Row(f"{title}: |promise - gain|", f"<= {MOST_PROMISE_OFF_DB:g} dB", f"{off:.2f} dB", met))
+            met = YES if off <= MOST_PREDICTION_OFF_DB else NO
+            rows.append(
+                Row(f"{title}: |predicted - measured gain|", f"<= {MOST_PREDICTION_OFF_DB:g} dB", f"{off:.2f} dB", met)
+            )
     return rows
 
 

@@ -151,7 +151,7 @@ SHAKEN = (
     _shaken("far", "photographs", 28.0, 2.2, 2.0),
     _shaken("plane", "leaves", 16.0, 0.9, 1.5, depth_m=1.6, sway_m=0.03),
     _shaken("noise", "photographs", 14.0, 1.6, 8.0),
-    _shaken("lamps", "bright", 14.0, 1.4, 2.0),
+    _shaken("highlights", "bright", 14.0, 1.4, 2.0, seed=1220),
 )
 """Blur of 5 to 45 px, a near plane, strong noise, clipped highlights; restored from the gyroscope and neighbours."""
 

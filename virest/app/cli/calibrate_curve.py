@@ -43,7 +43,7 @@ def calibrate_curve(
     \b
     $ virest calibrate-curve bracket --plot curve.png
     five_segment b (0.1564, 0.08188), c (0.794, 0.7961), y_max 1
-    fit error 1.34 grey levels rms, exposures 0.06215 to 1 covered
+    fit error 1.34 grey levels rms over exposures 0.06215 to 1
     the curve is known to ± 0.36 grey levels there
     ...
     $ virest calibrate-curve stills --exposures stills/exposures.csv

@@ -58,7 +58,7 @@ def shutter(
     \b
     $ virest evaluate shutter
     CASE A, rolling shutter: 50 frames of 5 captures, ...
-    method                 mean  spread     max  relative %  angles
+    method                 mean     std     max  relative %  angles
     none                 1.6641  1.9543  3.9687      1.8514     200
     schubert2018         0.3409  0.4457  1.7406      0.3798     200
     perspective          0.5059  0.6177  1.2699      0.5605     200
@@ -113,10 +113,10 @@ def deblur(
     \b
     $ virest evaluate deblur
     CASE B, motion blur: 12 frames, ...
-    method                          MSE  PSNR dB    SSIM  matches  in place
-    blurred                       606.2    20.30  0.7464      196       170
-    skimage richardson_lucy       359.0    22.58  0.7595      307       277
-    virest balanced                87.8    28.70  0.9206      727       681
+    method                          MSE  PSNR dB    SSIM  matches  correct
+    blurred                       606.2    20.30  0.7464      196      170
+    skimage richardson_lucy       359.0    22.58  0.7595      307      277
+    virest balanced                87.8    28.70  0.9206      727      681
     ...
     $ virest evaluate deblur --over-time
     $ virest evaluate deblur --restored virest-out/leaves/frames --reference leaves/truth/frames

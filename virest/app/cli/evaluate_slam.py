@@ -23,11 +23,11 @@ def slam(
         str | None,
         typer.Option(
             metavar="CMD",
-            help="Run this SLAM instead of COLMAP; needs {sequence} {trajectory}, knows {settings} {times} {seed}.",
+            help="Run this SLAM instead of COLMAP; needs {sequence} {trajectory}, may use {settings} {times} {seed}.",
         ),
     ] = None,
     seeds: Annotated[int | None, typer.Option(metavar="N", min=1, help="Runs per sequence. [3]")] = None,
-    devices: Annotated[bool, typer.Option("--devices", help="Also evaluate eight simulated phones.")] = False,
+    devices: Annotated[bool, typer.Option("--devices", help="Also evaluate eight simulated devices.")] = False,
     preset: Annotated[
         str, typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Preset of the restoration.")
     ] = "balanced",
@@ -52,7 +52,7 @@ def slam(
     print           29.5            6 ...
     shaken        20.733           12 ...
     ...
-    restored frames remove 99.6 % (median; least 95.7 %) of the error that the rolling shutter adds
+    restored frames remove 99.6 % (median; minimum 95.7 %) of the error that the rolling shutter adds
     ...
     $ virest evaluate slam walk --command 'mono_euroc_tum ORBvoc.txt {settings} {sequence} {times} {trajectory}'
     """  # noqa: D301

@@ -36,7 +36,7 @@ def export(
             "--stamps",
             metavar="NAME",
             callback=one_of(STAMPS),
-            help="Timestamps: logged, or instant (when the frame's content was seen).",
+            help="Timestamps: logged, or instant (when the frame's content was captured).",
         ),
     ] = "logged",
     poses: Annotated[

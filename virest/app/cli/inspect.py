@@ -23,7 +23,7 @@ def inspect(
     $ virest inspect sample_data/text
     text: usable
       kind          MARSLogger
-      movie         720x1280, 12 frames, 1 key frames
+      movie         720x1280, 12 frames, 1 key frame
     ...
     $ virest inspect sample_data/text --json | jq .frames
     """  # noqa: D301
