@@ -177,3 +177,19 @@ def test_an_offset_without_exposures_may_be_an_exposure() -> None:
     verdict = SimpleNamespace(nominal=Model(CameraProfile(640, 480), None, ()))
     (named,) = offset_as_timestamp(verdict, [finding], np.zeros(5))  # type: ignore[arg-type]
     assert [rival.name for rival in named.rivals] == ["exposure_time"]
+
+
+@pytest.mark.parametrize(("shift_s", "std_s", "name"), [
+    (-0.00295, 0.0001, "timestamp_reference"),
+    (-0.0005, 0.0001, "time_offset"),
+    (-0.0005, 0.001, "time_offset"),
+    (-0.0025, 0.001, "timestamp_reference"),
+])  # fmt: skip
+def test_an_offset_that_is_hardly_known_is_no_timestamp_reference(shift_s: float, std_s: float, name: str) -> None:
+    """At 6 ms the middle of the exposure is 3 ms away; a wide deviation does not bring 0.5 ms near it."""
+    change = {"time_offset_s": ParameterChange(0.004, 0.004 + shift_s, std_s)}
+    finding = Finding("time_offset", change, HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1), (), 1e-9, "")
+    model = Model(replace(CameraProfile(640, 480), time_offset_s=0.004), None, ())
+    verdict = SimpleNamespace(nominal=model, model=model)
+    (named,) = offset_as_timestamp(verdict, [finding], np.full(5, 0.006))  # type: ignore[arg-type]
+    assert named.name == name

@@ -16,7 +16,12 @@ from virest.diagnosis.findings import Finding, ParameterChange, Rival
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 
 Array = NDArray[np.float64]
-COINCIDENCE_SIGMA = 3.5
+COINCIDENCE_SIGMA, COINCIDENCE_PART = 3.5, 0.25
+"""An offset is another timestamp reference's if it lies within this many standard deviations of it and within this part.
+
+A standard deviation that an unmodelled effect has widened coincides with every reference; a quarter of the distance is
+half of what separates one reference from none.
+"""
 
 
 def offset_as_timestamp(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
@@ -74,7 +79,8 @@ def _meaning(now: str, shift_s: float, exposure_s: float, std_s: float) -> str |
     """The timestamp reference equivalent to an offset: its first row starts later by (now − meaning) exposures."""
     for meaning, fraction in STAMP_FRACTION.items():
         expected = (STAMP_FRACTION[now] - fraction) * exposure_s
-        if meaning != now and abs(shift_s - expected) < COINCIDENCE_SIGMA * std_s:
+        near = min(COINCIDENCE_SIGMA * std_s, COINCIDENCE_PART * abs(expected))
+        if meaning != now and abs(shift_s - expected) < near:
             return meaning
     return None
 
