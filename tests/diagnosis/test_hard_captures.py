@@ -185,7 +185,7 @@ def test_an_offset_without_exposures_may_be_an_exposure() -> None:
     (-0.0005, 0.001, "time_offset"),
     (-0.0025, 0.001, "timestamp_reference"),
 ])  # fmt: skip
-def test_an_offset_that_is_hardly_known_is_no_timestamp_reference(shift_s: float, std_s: float, name: str) -> None:
+def test_an_offset_hardly_known_is_no_timestamp_reference(shift_s: float, std_s: float, name: str) -> None:
     """At 6 ms the middle of the exposure is 3 ms away; a wide deviation does not bring 0.5 ms near it."""
     change = {"time_offset_s": ParameterChange(0.004, 0.004 + shift_s, std_s)}
     finding = Finding("time_offset", change, HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1), (), 1e-9, "")

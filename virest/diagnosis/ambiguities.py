@@ -17,11 +17,8 @@ from virest.diagnosis.geometric_verdict import GeometricVerdict
 
 Array = NDArray[np.float64]
 COINCIDENCE_SIGMA, COINCIDENCE_PART = 3.5, 0.25
-"""An offset is another timestamp reference's if it lies within this many standard deviations of it and within this part.
-
-A standard deviation that an unmodelled effect has widened coincides with every reference; a quarter of the distance is
-half of what separates one reference from none.
-"""
+"""An offset is attributed to another timestamp reference if it agrees within this many standard deviations and within
+this part of the reference's own shift: a deviation that an unmodelled effect has widened agrees with everything."""
 
 
 def offset_as_timestamp(geometric: GeometricVerdict, findings: list[Finding], exposure_s: Array) -> list[Finding]:
