@@ -210,7 +210,9 @@ def test_jitter_has_a_random_stream_of_its_own():
         settings = SessionSettings(frames=30, seed=5, near_m=near_m)
         camera = nominal_camera(64, 48, depth_m=2.0)
         session = plan_session(camera, camera, settings)
-        jittered = dataclasses.replace(session, settings=dataclasses.replace(settings, isp=PhoneIsp(gyro_jitter_s=1e-4)))
+        jittered = dataclasses.replace(
+            session, settings=dataclasses.replace(settings, isp=PhoneIsp(gyro_jitter_s=1e-4))
+        )
         return 1e-9 * (sample_imu(jittered).time_ns - sample_imu(session).time_ns)
 
     alone, with_objects = jitter_s(None), jitter_s(1.0)
