@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from virest.app.calibrate import find_calibration, plan_calibration
@@ -58,6 +60,31 @@ def test_a_global_shutter_is_found(capture: Callable[..., Path], hidden: bool) -
     assert (profile.shutter.readout_time_s, profile.time_offset_s) == (0.0, offset["value"])
     assert "readout_direction" not in profile.estimates
     assert not [note for note in facts["notes"] if "implausible" in note]
+
+
+def without_accelerometer(folder: Path, out: Path) -> Path:
+    """A copy of a capture whose log has no accelerometer values."""
+    shutil.copytree(folder, out)
+    log = out / "gyro_accel.csv"
+    head, *rows = (line.split(",") for line in log.read_text().splitlines())
+    emptied = [[*row[:4], "null", "null", "null", *row[7:]] for row in rows]
+    log.write_text("\n".join(",".join(row) for row in [head, *emptied]) + "\n")
+    return out
+
+
+@pytest.mark.parametrize("seed", [72, 73])
+def test_travel_without_an_accelerometer_is_not_a_sure_gyro_bias(
+    capture: Callable[..., Path], tmp_path: Path, seed: int
+) -> None:
+    """Before a wall, yaw and pitch look like travel: the deviations of axes and bias contain it."""
+    folder = without_accelerometer(capture(f"wall-{seed}", depth_m=1.5, seed=seed), tmp_path / "gyro-only")
+    facts, profile = calibrated(folder)
+    assert facts["translation"] == "direction"
+    for name, true in (("rotation_rad", 0.0), ("gyro_bias_rad_s", 0.0), ("readout_time_s", 0.02)):
+        value = value_of(facts, name)
+        error = np.abs(np.subtract(value["value"], true))
+        assert (error < LARGEST_SIGMA * np.array(value["std"])).all(), name
+    assert np.abs(profile.gyro_bias_rad_s).max() < 0.006
 
 
 def wrong_focal(folder: Path, out: Path, factor: float) -> Path:

@@ -416,12 +416,14 @@ def _conclude(
     else:
         bias = {term.name: bias_std(fit, term.name, noise) for term in fit.terms}
     variances = variances_of(fit, bias, _drift_rad(fit, imu))
+    if isinstance(fit.scene, DirectedMotion):
+        turn_rad, rate_rad_s = _mistaken_rotation(joint, coarse)
+        variances["imu_rotation"] = variances["imu_rotation"] + turn_rad**2
+        variances["gyro_bias"] = variances["gyro_bias"] + rate_rad_s**2
     rolling = not global_shutter(fit, variances)
-    beyond = beyond_limits(fit, observed, rolling)
-    determined = {
-        term.name: term.name not in beyond and is_determined(fit, term.name, variances[term.name], rolling)
-        for term in fit.terms
-    }
+    determined = {term.name: is_determined(fit, term.name, variances[term.name], rolling) for term in fit.terms}
+    beyond = {name: reason for name, reason in beyond_limits(fit, observed, rolling).items() if determined[name]}
+    determined = {name: known and name not in beyond for name, known in determined.items()}
     is_global = not rolling and determined["readout_time"]
     profile = right_way_round(reset_undetermined(fit, given, start, determined))
     if is_global:
@@ -461,6 +463,21 @@ def _drift_rad(fit: TrackFit, imu: ImuSamples) -> tuple[float, float]:
     span_s = float(np.ptp(fit.seconds)) / fit.scene.windows
     inverse_depth_per_m = float(np.median(np.linalg.norm(fit.scene.plane_per_m, axis=-1)))
     return drift_std_m(imu, span_s) * inverse_depth_per_m, max(span_s, 0.1)
+
+
+def _mistaken_rotation(joint: _Joint, coarse: CoarseAlignment) -> tuple[float, float]:
+    """Standard deviations of axes (rad) and gyroscope bias (rad/s) due to translation taken for rotation.
+
+    Without an accelerometer, yaw and pitch before a plane differ from translation by second-order terms only.  What the
+    fit leaves unexplained may thus be a rotation in every pair: at a constant rate, or in step with the camera's own.
+    """
+    observed = joint.observed
+    excess = residual_px(joint.fit) ** 2 - tracking_noise_px(observed, joint.fit) ** 2
+    turn_rad = max(excess, 0.0) ** 0.5 / observed.lens.fx_px
+    period_s = float(
+        np.median([observed.stamp_s[pair.second] - observed.stamp_s[pair.first] for pair in observed.pairs])
+    )
+    return turn_rad / coarse.motion_rad, turn_rad / period_s
 
 
 def _gyro_mean_std_rad_s(imu: ImuSamples, span_s: float) -> float:
