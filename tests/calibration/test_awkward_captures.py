@@ -13,9 +13,12 @@ import pytest
 
 from virest.app.calibrate import find_calibration, plan_calibration
 from virest.app.simulate import simulate_command
+from virest.calibration.geometry import calibrate_geometry
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import read_profile, write_profile
+from virest.capture.video import GrayReader, probe_movie
 from virest.errors import CalibrationError
+from virest.inference.guide_choice import track_guided
 
 LARGEST_SIGMA = 4.0
 SIZE = {"width": 320, "height": 240, "frames": 45, "exposure_ms": 6.0, "rate_rad_s": 1.2, "truth_frames": False}
@@ -114,3 +117,17 @@ def test_a_focal_length_that_is_not_asked_for_is_suspected(capture: Callable[...
         calibrated(folder, config=wrong_focal(folder, tmp_path / "wrong.yaml", 1.8))
     assert "--with focal" in str(refused.value.hint)
     assert "0.5" in str(refused.value.hint)
+
+
+def test_drifting_clocks_are_fitted_as_if_asked_for(capture: Callable[..., Path]) -> None:
+    """The fit that goes on from a single offset ends where one with a skew from the start does."""
+    plan = plan_calibration(capture("drifting", "clock_skew=0.002", seed=54))
+    gray = GrayReader(plan.capture.movie, probe_movie(plan.capture.movie))
+    pairs = track_guided(plan.capture, plan.profile, gray, plan.frames)
+    unasked, asked = (calibrate_geometry(plan.capture, plan.profile, pairs, extra) for extra in ((), ("clock-skew",)))
+    assert "fitted too" in unasked.notes[0]
+    for one, other in zip(unasked.values, asked.values, strict=True):
+        assert (one.name, one.determined) == (other.name, other.determined)
+        if one.std is not None:
+            assert (np.abs(np.subtract(one.value, other.value)) < 0.1 * np.array(one.std)).all(), one.name
+            np.testing.assert_allclose(one.std, other.std, rtol=0.05)
