@@ -72,6 +72,8 @@ CONSTANT_EXPOSURE_S = 1e-4
 """If exposures vary by less, an offset cannot be separated from their scale, nor from the timestamp reference."""
 DRIFT_SIGMA, LEAST_DRIFT_S = 4.5, 1e-3
 """Clock skew is fitted if the drift exceeds this many σ (false-alarm probability 7e-6) and this much per capture."""
+SMALL_DRIFT_S = 0.02
+"""Below this drift per capture, and without translation, the fit with a skew starts from the one without."""
 OTHER_FOCAL = 0.1
 """Smallest relative error of the focal length that is corrected before the fit, or suspected in an error message."""
 FRAME_LAG = "frame-lag"
@@ -137,8 +139,8 @@ def calibrate_geometry(
         lag = fit_start_up_lag(capture, observed, profile)
         observed = _at_true_times(capture, observed, lag)
     names = list(dict.fromkeys([*extra, *(["focal"] if profile.intrinsics is None else [])]))
-    observed, coarse, start = _started(observed, capture.imu, profile, names)
-    observed = observed.covered(capture.imu, start)
+    whole, coarse, start = _started(observed, capture.imu, profile, names)
+    observed = whole.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
         raise CalibrationError(f"{len(observed.pairs)} pairs of frames lie inside the inertial data")
     report("coarse")
@@ -146,15 +148,17 @@ def calibrate_geometry(
     report("readout")
     joint = _fit_jointly(capture.imu, observed, rough, names)
     drift = joint.held.get("clock-skew")
-    drifts = _clocks_drift(drift, float(np.ptp(joint.fit.seconds)))
+    span_s = float(np.ptp(joint.fit.seconds))
+    drifts = _clocks_drift(drift, span_s)
     if drift is not None and drifts:
-        _, coarse, start = _started(observed, capture.imu, _skewed(profile, drift), names)
         names.append("clock-skew")
-        if rough.is_plain:
+        if rough.is_plain and abs(float(drift.change[0])) * span_s < SMALL_DRIFT_S:
+            _, coarse, start = _started(observed, capture.imu, _skewed(profile, drift), names[:-1])
             rough = replace(rough, profile=_skewed(joint.fit.profile, drift, float(np.mean(joint.fit.seconds))))
-        else:
-            again = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, names)
-            rough = replace(again, before=rough.before)
+        else:  # the first fit may be far off: search for offset and skew again
+            whole, coarse, start = _started(whole, capture.imu, profile, names)
+            observed = whole.covered(capture.imu, start)
+            rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, names)
         joint = _fit_jointly(capture.imu, observed, rough, names)
     found = _conclude(capture.imu, profile, start, coarse, rough, joint)
     report("joint")
