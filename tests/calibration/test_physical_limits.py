@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from virest.calibration.physical_limits import impossible, is_depth, limit_reasons
+from virest.calibration.physical_limits import impossible, is_depth, is_global, limit_reasons
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
@@ -23,11 +23,28 @@ def test_a_phone_is_possible() -> None:
     assert not impossible(PHONE, PERIOD_S, 0.0)
 
 
-@pytest.mark.parametrize("readout_s", [0.0, 2.9e-4, -2.9e-4, 0.0334, 0.06])
+@pytest.mark.parametrize("readout_s", [2.9e-4, -2.9e-4, 0.0334, 0.06])
 def test_no_sensor_reads_so_fast_or_so_slowly(readout_s: float) -> None:
-    """A rolling shutter takes a millisecond at least and a frame period at most."""
+    """A rolling shutter takes a millisecond at least and a frame period at most; a global one takes 0."""
     shutter = replace(PHONE.shutter, readout_time_s=readout_s)
     assert impossible(replace(PHONE, shutter=shutter), PERIOD_S, EXPOSURE_S) == {"readout_time"}
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 6e-5, -6e-5])
+def test_a_global_shutter_reads_all_rows_at_once(readout_s: float) -> None:
+    """A readout of 0 is no implausible rolling shutter, and neither is a fitted one beside it."""
+    profile = replace(PHONE, shutter=replace(PHONE.shutter, readout_time_s=readout_s))
+    assert not impossible(profile, PERIOD_S, EXPOSURE_S)
+    assert not limit_reasons(profile, PERIOD_S, EXPOSURE_S)
+
+
+def test_a_readout_is_zero_within_its_deviation() -> None:
+    """Three deviations, unless a rolling shutter lies within them too."""
+    assert is_global(0.0)
+    assert is_global(-2.9e-4, 1e-4)
+    assert not is_global(2.9e-4, 5e-5)
+    assert not is_global(0.0, 4e-4)
+    assert not is_global(0.0207, 1e-5)
 
 
 @pytest.mark.parametrize("scale", [0.05, 4.5, 20.0])

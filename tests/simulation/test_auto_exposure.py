@@ -74,6 +74,12 @@ def test_a_staircase_climbs_in_equal_steps(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(path, np.repeat([-2.5, 0.0, 2.5], 3))
 
 
+@pytest.mark.parametrize("steps", [None, 3])
+def test_a_single_frame_is_exposed_as_usual(steps: int | None, rng: np.random.Generator) -> None:
+    """It is neither the dark nor the bright end of a range."""
+    assert light_path_ev(AutoExposure(4.0, steps), 1, rng).tolist() == [0.0]
+
+
 def test_exposures_stay_within_the_frame_and_iso_above_its_lowest(rng: np.random.Generator) -> None:
     """Where one of the two cannot follow the other does; their product is the light all the same."""
     plan = plan_exposures((0.008,), AutoExposure(10.0, 21), 21, 30.0, rng)

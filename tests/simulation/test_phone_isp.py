@@ -1,5 +1,6 @@
 """What a phone does to its pictures and samples: each strength against its own law, and the capture as a whole."""
 
+import dataclasses
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,7 @@ from virest.simulation.phone_pictures import (
     sharpen,
     tone_curve,
 )
+from virest.simulation.session import SessionSettings, nominal_camera, plan_session, sample_imu
 
 LUMA = np.array([0.299, 0.587, 0.114])
 
@@ -199,6 +201,24 @@ def test_the_log_shows_the_noise_of_the_gyroscope(simulate):
     time_ns, gyro, _ = read_imu(simulate("noisy", rate_rad_s=0.0, frames=30, isp=isp))
     assert gyro.std() == pytest.approx(0.01, rel=0.1)
     assert np.diff(time_ns).std() == pytest.approx(np.sqrt(2) * 0.0003e9, rel=0.15)
+
+
+def test_jitter_has_a_random_stream_of_its_own():
+    """Objects before the scene are drawn from [seed, 7]; without them the jitter is, as in all earlier captures."""
+
+    def jitter_s(near_m):
+        settings = SessionSettings(frames=30, seed=5, near_m=near_m)
+        camera = nominal_camera(64, 48, depth_m=2.0)
+        session = plan_session(camera, camera, settings)
+        jittered = dataclasses.replace(
+            session, settings=dataclasses.replace(settings, isp=PhoneIsp(gyro_jitter_s=1e-4))
+        )
+        return 1e-9 * (sample_imu(jittered).time_ns - sample_imu(session).time_ns)
+
+    alone, with_objects = jitter_s(None), jitter_s(1.0)
+    shared = 1e-4 * np.random.default_rng([5, 7]).normal(size=len(alone))
+    np.testing.assert_allclose(alone, shared, atol=1e-9)
+    assert abs(np.corrcoef(with_objects, shared)[0, 1]) < 0.3
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from virest.camera.profile_file import read_profile
 from virest.errors import OutputError, SettingsError
 from virest.simulation import recording
+from virest.simulation.effects import AppliedEffect
 from virest.simulation.recording import yuv_planes
+from virest.simulation.session import SessionSettings, nominal_camera, plan_session
 
 FILES = {"movie.mp4", "frame_timestamps.txt", "movie_metadata.csv", "gyro_accel.csv", "edge_epochs.txt", "camera.yaml",
          "truth"}  # fmt: skip
@@ -37,6 +39,22 @@ def test_the_folder_is_complete(plain_capture):
         "camera.yaml",
         "effects.json",
     }
+
+
+def test_the_truth_file_is_strict_json(tmp_path):
+    """Infinities as words, NaN as null, and a text that contains the word left alone."""
+    profile = nominal_camera(32, 32)
+    session = plan_session(profile, profile, SessionSettings(frames=1, seed=1))
+    odd = {"far": np.inf, "parts": (-np.inf, float("nan"), 1.5), "note": "Infinity"}
+    recording.write_recording(session, tmp_path / "odd", applied=(AppliedEffect("scene_depth", odd),))
+
+    def refuse(word):
+        raise AssertionError(word)
+
+    truth = json.loads((tmp_path / "odd/truth/effects.json").read_text(), parse_constant=refuse)
+    told = truth["effects"][0]["parameters"]
+    assert told == {"far": "inf", "parts": ["-inf", None, 1.5], "note": "Infinity"}
+    assert truth["scene_plane"]["depth_m"] == "inf"
 
 
 @pytest.mark.parametrize("fps", [30.0, 29.94, 60.0])

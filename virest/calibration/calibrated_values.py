@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.calibration.physical_limits import limit_reasons
+from virest.calibration.physical_limits import is_global, limit_reasons
 from virest.camera.profile import CameraProfile
-from virest.effects.changes import rotation_between
+from virest.effects.changes import keep_readout, rotation_between
 from virest.effects.records import Calibrated
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import right_way_round
@@ -22,6 +22,7 @@ MIN_STRETCHES = 2.5
 """A value must be supported by this effective number of time blocks; with fewer, nothing confirms it."""
 LARGE_CORRELATION = 0.9
 NO_FINDING = "no camera has it"
+GLOBAL_SHUTTER = "global shutter: no readout direction"
 ROUGH_OFFSET_S = 0.01
 """A time offset with at most this standard deviation is written as rough; a worse one is no better than a default."""
 
@@ -51,21 +52,40 @@ def calibrated(effect: str) -> Calibrated:
     return found
 
 
-def beyond_limits(fit: TrackFit, observed: ObservedTracks) -> dict[str, str]:
-    """Fitted terms with physically impossible values, and the reason for each."""
+def global_shutter(fit: TrackFit, variances: dict[str, Array]) -> bool:
+    """Whether the fitted readout is that of a global shutter, which has no direction."""
+    if "readout_time" not in variances:
+        return False
+    return is_global(fit.profile.shutter.readout_time_s, float(np.sqrt(variances["readout_time"][0])))
+
+
+def without_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+    """The profile with a readout of 0 and the given direction; the middle row keeps its time."""
+    bare = replace(given.shutter, readout_time_s=0.0, uneven=None)
+    kept = keep_readout(profile, replace(given, shutter=bare))
+    return replace(kept, shutter=replace(kept.shutter, uneven=None))
+
+
+def beyond_limits(fit: TrackFit, observed: ObservedTracks, rolling: bool = True) -> dict[str, str]:
+    """Fitted terms with physically impossible values, and the reason for each.
+
+    rolling: whether the readout is a rolling shutter's; a global shutter's is possible.
+    """
     stamps = observed.stamp_s[np.isfinite(observed.stamp_s)]
     period_s, fitted = float(np.median(np.diff(stamps))), right_way_round(fit.profile)
     reasons = limit_reasons(fitted, period_s, float(np.median(observed.exposure_s)))
+    if not rolling:
+        reasons.pop("readout_time", None)
     return {term.name: reasons[term.name] for term in fit.terms if term.name in reasons}
 
 
-def is_determined(fit: TrackFit, name: str, variance: Array) -> bool:
+def is_determined(fit: TrackFit, name: str, variance: Array, rolling: bool = True) -> bool:
     """Whether a term is precise enough and supported by enough time blocks.
 
-    A readout within two standard deviations of 0 is not determined, since its direction is unknown.
+    A rolling shutter's readout within two standard deviations of 0 is not determined, since its direction is unknown.
     """
     known = bool(np.all(np.sqrt(variance) <= calibrated(name).max_std))
-    if name == "readout_time" and abs(fit.profile.shutter.readout_time_s) < 2 * float(np.sqrt(variance[0])):
+    if rolling and name == "readout_time" and abs(fit.profile.shutter.readout_time_s) < 2 * float(np.sqrt(variance[0])):
         return False
     return known and bool(np.all(fit.stretches[fit.slices[name]] >= MIN_STRETCHES))
 

@@ -15,18 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.calibration.calibrated_values import (
+    GLOBAL_SHUTTER,
     NO_FINDING,
     CalibratedValue,
     beyond_limits,
     calibrated,
     correlations_of,
     direction_value,
+    global_shutter,
     is_determined,
     reset_undetermined,
     roughly_known,
     value_of,
     variances_of,
     with_estimates,
+    without_readout,
 )
 from virest.calibration.unfitted_parameters import OPTIONAL, HeldValue, held_notes, held_values
 from virest.camera.kalibr import measure_imu_noise
@@ -63,10 +66,16 @@ DIRECTION_COST = 12.0
 OUTLIER_WEIGHT = 0.1
 EXCLUSION_PASSES = 3
 MANY_OUTLIERS = 0.1
+SMALL_PART = 0.01
+"""Smallest fraction of points that a note states as a number."""
 CONSTANT_EXPOSURE_S = 1e-4
 """If exposures vary by less, an offset cannot be separated from their scale, nor from the timestamp reference."""
 DRIFT_SIGMA, LEAST_DRIFT_S = 4.5, 1e-3
 """Clock skew is fitted if the drift exceeds this many σ (false-alarm probability 7e-6) and this much per capture."""
+SMALL_DRIFT_S = 0.02
+"""Below this drift per capture, and without translation, the fit with a skew starts from the one without."""
+OTHER_FOCAL = 0.1
+"""Smallest relative error of the focal length that is corrected before the fit, or suspected in an error message."""
 FRAME_LAG = "frame-lag"
 """Start-up lag; an additional key of ``--with``."""
 
@@ -129,43 +138,42 @@ def calibrate_geometry(
     if FRAME_LAG in extra and len(observed.pairs) >= MIN_PAIRS:
         lag = fit_start_up_lag(capture, observed, profile)
         observed = _at_true_times(capture, observed, lag)
-    coarse, skew = _require_coarse(observed, capture.imu, profile, "clock-skew" in extra)
-    unknown_focal = profile.intrinsics is None
-    start = replace(_started(profile, observed, coarse), clock_skew=skew)
-    observed = observed.covered(capture.imu, start)
+    names = list(dict.fromkeys([*extra, *(["focal"] if profile.intrinsics is None else [])]))
+    whole, coarse, start = _started(observed, capture.imu, profile, names)
+    observed = whole.covered(capture.imu, start)
     if len(observed.pairs) < MIN_PAIRS:
         raise CalibrationError(f"{len(observed.pairs)} pairs of frames lie inside the inertial data")
     report("coarse")
-    wanted = [terms_of.TIME_OFFSET, terms_of.GYRO_BIAS, terms_of.IMU_ROTATION]
-    names = list(dict.fromkeys([*extra, *(["focal"] if unknown_focal else [])]))
-    asked = [OPTIONAL[name] for name in names if name in OPTIONAL]
-    wanted += [term for term in asked if term is terms_of.FOCAL]
-    rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, wanted, asked)
-    rough = _with_uneven_rows(rough, start)
+    rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, names)
     report("readout")
-    wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS, *asked]
-    excluded = 0.0
-    for _ in range(EXCLUSION_PASSES):
-        table = observed.table(MANY_POINTS)
-        fit = fit_tracks(capture.imu, table, rough.profile, wanted, for_table(rough.scene, table))
-        observed, newly_excluded = observed.without_astray(table.first_px, fit.distance)
-        excluded += (1 - excluded) * newly_excluded
-        if not newly_excluded:
-            break
-    corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
-    if corrected:  # without an accelerometer the blur due to translation is unknown
-        table = replace(table, second_px=table.second_px - blur_bias_px(fit.ground, table))
-        fit = fit_tracks(capture.imu, table, fit.profile, wanted, fit.scene)
-    vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
-    held = held_values(capture.imu, table, fit, float(np.median(observed.noise_px)), vary)
-    if _clocks_drift(held.get("clock-skew"), float(np.ptp(fit.seconds))):
-        found = calibrate_geometry(capture, profile, pairs, (*extra, "clock-skew"))
-        report("joint")
-        return replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
-    found = _conclude(capture.imu, profile, start, observed, coarse, rough, fit, excluded, corrected)
+    joint = _fit_jointly(capture.imu, observed, rough, names)
+    drift = joint.held.get("clock-skew")
+    span_s = float(np.ptp(joint.fit.seconds))
+    drifts = _clocks_drift(drift, span_s)
+    if drift is not None and drifts:
+        names.append("clock-skew")
+        if rough.is_plain and abs(float(drift.change[0])) * span_s < SMALL_DRIFT_S:
+            _, coarse, start = _started(observed, capture.imu, _skewed(profile, drift), names[:-1])
+            rough = replace(rough, profile=_skewed(joint.fit.profile, drift, float(np.mean(joint.fit.seconds))))
+        else:  # the first fit may be far off: search for offset and skew again
+            whole, coarse, start = _started(whole, capture.imu, profile, names)
+            observed = whole.covered(capture.imu, start)
+            rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, names)
+        joint = _fit_jointly(capture.imu, observed, rough, names)
+    found = _conclude(capture.imu, profile, start, coarse, rough, joint)
     report("joint")
-    found = replace(found, notes=(*found.notes, *held_notes(held, names), *_uneven_note(found.profile, profile)))
+    notes = (*found.notes, *held_notes(joint.held, names), *_uneven_note(found.profile, profile))
+    if drifts:
+        notes = (_drift_note(found, profile.clock_skew), *notes)
+    found = replace(found, notes=notes)
     return found if lag is None else _with_lag(found, lag)
+
+
+def _skewed(profile: CameraProfile, skew: HeldValue, at_s: float = 0.0) -> CameraProfile:
+    """The profile with a clock skew that was held fixed; frames at ``at_s`` keep their time."""
+    change = float(skew.change[0])
+    offset_s = (profile.time_offset_s or 0.0) - at_s * change if at_s else profile.time_offset_s
+    return replace(profile, clock_skew=profile.clock_skew + change, time_offset_s=offset_s)
 
 
 def _clocks_drift(skew: HeldValue | None, span_s: float) -> bool:
@@ -203,9 +211,14 @@ def _with_lag(found: GeometryCalibration, lag: StartUpLag) -> GeometryCalibratio
 # ── coarse ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _require_coarse(
-    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, free_skew: bool
-) -> tuple[CoarseAlignment, float]:
+def _started(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, names: Sequence[str]
+) -> tuple[ObservedTracks, CoarseAlignment, CameraProfile]:
+    """The points with the lens they start from, the coarse alignment, and the profile with its offset, axes and skew.
+
+    names: keys of the values to fit.  If one is the focal length, a wrong one is scaled until the frames follow the
+    gyroscope.  Raises CalibrationError if they never do.
+    """
     if len(observed.pairs) < MIN_PAIRS:
         raise CalibrationError(
             f"{len(observed.pairs)} pairs of frames have enough trackable points, {MIN_PAIRS} are needed",
@@ -213,27 +226,45 @@ def _require_coarse(
         )
     if len(imu) < 8:
         raise CalibrationError(f"{len(imu)} gyroscope samples", hint="check gyro_accel.csv")
-    turns, skew = observed.turns(profile), profile.clock_skew
-    coarse = align_coarsely(turns, imu, profile)
-    if free_skew and (found := align_with_skew(turns, imu, profile)) is not None:
-        coarse, skew = found
+    coarse, skew = _aligned(observed, imu, profile, "clock-skew" in names)
+    doubt = coarse.doubt(len(observed.pairs), observed.lens.fx_px)
+    if doubt is not None and (other := _other_focal(observed, imu, profile)) is not None:
+        if "focal" not in names:
+            hint = (
+                f"at {other.gain:.2f} times the profile's focal length it explains {other.explained:.0%}: "
+                "pass --with focal, or correct intrinsics.fx_px"
+            )
+            raise CalibrationError(doubt[0], hint=hint)
+        observed = replace(observed, lens=observed.lens.scaled_focal(other.gain))
+        coarse, skew = _aligned(observed, imu, profile, "clock-skew" in names)
+        doubt = coarse.doubt(len(observed.pairs), observed.lens.fx_px)
+    if doubt is not None:
+        raise CalibrationError(doubt[0], hint=doubt[1])
+    axes = tuple(map(tuple, coarse.rotation_cam_imu.tolist()))
+    start = replace(profile, time_offset_s=coarse.time_offset_s, r_cam_imu=axes, clock_skew=skew)
+    return observed, coarse, replace(start, intrinsics=observed.lens)
+
+
+def _aligned(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, free_skew: bool
+) -> tuple[CoarseAlignment, float]:
+    """The coarse alignment and its clock skew.  Raises CalibrationError if no offset covers the frames."""
+    turns = observed.turns(profile)
+    found = align_with_skew(turns, imu, profile) if free_skew else None
+    coarse, skew = found or (align_coarsely(turns, imu, profile), profile.clock_skew)
     if coarse is None:
         raise CalibrationError(
             "no offset within one second makes the inertial data cover the frames", hint="see virest inspect"
         )
-    if (doubt := coarse.doubt(len(observed.pairs), observed.lens.fx_px)) is not None:
-        raise CalibrationError(doubt[0], hint=doubt[1])
     return coarse, skew
 
 
-def _started(profile: CameraProfile, observed: ObservedTracks, coarse: CoarseAlignment) -> CameraProfile:
-    """The profile with the coarse offset and axes, and a default lens if it has none."""
-    return replace(
-        profile,
-        time_offset_s=coarse.time_offset_s,
-        r_cam_imu=tuple(map(tuple, coarse.rotation_cam_imu.tolist())),
-        intrinsics=profile.intrinsics or observed.lens,
-    )
+def _other_focal(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> CoarseAlignment | None:
+    """The alignment with another focal length at which the frames follow the gyroscope; None: there is none."""
+    found = align_coarsely(observed.turns(profile), imu, profile, free_focal=True)
+    if found is None or found.doubt(len(observed.pairs), observed.lens.fx_px) is not None:
+        return None
+    return found if abs(found.gain - 1) > OTHER_FOCAL else None
 
 
 # ── readout and translation ──────────────────────────────────────────────────────────────────────────────────────
@@ -247,15 +278,21 @@ class _Rough:
     before: TrackFit
     """Fit of the time offset alone, with the start profile's readout."""
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether the points determined the readout's axis and needed no translation."""
+        return self.direction_known and self.scene is None
 
-def _readout_axis(
-    imu: ImuSamples, table: TrackTable, start: CameraProfile, wanted: list[Term], asked: list[Term]
-) -> _Rough:
+
+def _readout_axis(imu: ImuSamples, table: TrackTable, start: CameraProfile, names: Sequence[str]) -> _Rough:
     """Fit a readout of either sign along rows and along columns, and keep the better axis.
 
-    asked: optional terms of the joint fit.  They are fitted here only if the points then need no translation, since a
-    wrong lens alone looks like translation.
+    names: optional values of the joint fit.  Except for the focal length, they are fitted here only if the points then
+    need no translation, since a wrong lens alone looks like translation.
     """
+    asked = _optional(names)
+    wanted = [terms_of.TIME_OFFSET, terms_of.GYRO_BIAS, terms_of.IMU_ROTATION]
+    wanted += [term for term in asked if term is terms_of.FOCAL]
     along = "left_to_right" if start.shutter.reads_columns else "top_to_bottom"
     across = "top_to_bottom" if start.shutter.reads_columns else "left_to_right"
     before = fit_tracks(imu, table, start, wanted[:1], max_iterations=4)
@@ -268,7 +305,8 @@ def _readout_axis(
         plain = fit_tracks(imu, table, best.profile, fitted)
         best = plain if plain.scale < EXPLAINED_SCALE else best
     log.debug("readout: cost %.1f %s, %.1f %s", first.cost, along, second.cost, across)
-    return _Rough(best.profile, best.scene, abs(difference) > DIRECTION_COST, before)
+    rough = _Rough(best.profile, best.scene, abs(difference) > DIRECTION_COST, before)
+    return _with_uneven_rows(rough, start)
 
 
 def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
@@ -322,6 +360,46 @@ def _fit_with_translation(
     return fit_directed(imu, table, start, wanted)
 
 
+# ── joint fit ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class _Joint:
+    fit: TrackFit
+    observed: ObservedTracks
+    """The points, without those of image regions that move independently."""
+    excluded: float
+    """Fraction of the points excluded as moving independently."""
+    corrected: bool
+    """Whether the blur bias was removed from the points, so that the fit's change measures what may remain of it."""
+    held: dict[str, HeldValue]
+    """Optional values that were not fitted, by key of OPTIONAL."""
+
+
+def _optional(names: Sequence[str]) -> list[Term]:
+    return [OPTIONAL[name] for name in names if name in OPTIONAL]
+
+
+def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names: Sequence[str]) -> _Joint:
+    """Fit all requested values to many points, without image regions that move independently and without blur bias."""
+    wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS, *_optional(names)]
+    excluded = 0.0
+    for _ in range(EXCLUSION_PASSES):
+        table = observed.table(MANY_POINTS)
+        fit = fit_tracks(imu, table, rough.profile, wanted, for_table(rough.scene, table))
+        observed, newly_excluded = observed.without_astray(table.first_px, fit.distance)
+        excluded += (1 - excluded) * newly_excluded
+        if not newly_excluded:
+            break
+    corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
+    if corrected:  # without an accelerometer the blur due to translation is unknown
+        table = replace(table, second_px=table.second_px - blur_bias_px(fit.ground, table))
+        fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene)
+    vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
+    held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)
+    return _Joint(fit, observed, excluded, corrected, held)
+
+
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -329,31 +407,32 @@ def _conclude(
     imu: ImuSamples,
     given: CameraProfile,
     start: CameraProfile,
-    observed: ObservedTracks,
     coarse: CoarseAlignment,
     rough: _Rough,
-    fit: TrackFit,
-    excluded: float,
-    corrected: bool,
+    joint: _Joint,
 ) -> GeometryCalibration:
-    """Assess and assemble the result.
-
-    excluded: fraction of points excluded as moving independently.  corrected: whether the blur bias was removed from
-    the points, so that the fit's change measures what may remain of it.
-    """
+    """Assess and assemble the result."""
+    fit, observed = joint.fit, joint.observed
     noise = float(np.median(observed.noise_px))
-    if corrected:
+    if joint.corrected:
         gyro_rad_s = _gyro_mean_std_rad_s(imu, float(np.ptp(fit.seconds)))
         bias = {term.name: remaining_std(fit, term.name, fit.value(term.name), gyro_rad_s) for term in fit.terms}
     else:
         bias = {term.name: bias_std(fit, term.name, noise) for term in fit.terms}
     variances = variances_of(fit, bias, _drift_rad(fit, imu))
-    beyond = beyond_limits(fit, observed)
-    determined = {
-        term.name: term.name not in beyond and is_determined(fit, term.name, variances[term.name]) for term in fit.terms
-    }
+    if isinstance(fit.scene, DirectedMotion):
+        turn_rad, rate_rad_s = _mistaken_rotation(joint, coarse)
+        variances["imu_rotation"] = variances["imu_rotation"] + turn_rad**2
+        variances["gyro_bias"] = variances["gyro_bias"] + rate_rad_s**2
+    rolling = not global_shutter(fit, variances)
+    determined = {term.name: is_determined(fit, term.name, variances[term.name], rolling) for term in fit.terms}
+    beyond = {name: reason for name, reason in beyond_limits(fit, observed, rolling).items() if determined[name]}
+    determined = {name: known and name not in beyond for name, known in determined.items()}
+    is_global = not rolling and determined["readout_time"]
     profile = right_way_round(reset_undetermined(fit, given, start, determined))
-    if not rough.direction_known and not determined["readout_time"]:
+    if is_global:
+        profile = without_readout(profile, given)
+    elif not rough.direction_known and not determined["readout_time"]:
         profile = keep_readout(profile, given)
     values = tuple(
         value_of(term.name, given, profile, fit.profile, variances[term.name], determined[term.name])
@@ -364,11 +443,14 @@ def _conclude(
     values = tuple(
         replace(value, note=NO_FINDING, implausible=True) if value.name in kept else value for value in values
     )
-    direction_known = rough.direction_known and determined["readout_time"]
-    values = (*values[:2], direction_value(given, profile, direction_known), *values[2:])
+    if is_global:
+        values = tuple(replace(v, note=GLOBAL_SHUTTER) if v.name == "readout_time_s" else v for v in values)
+    else:
+        direction_known = rough.direction_known and determined["readout_time"]
+        values = (*values[:2], direction_value(given, profile, direction_known), *values[2:])
     profile = with_estimates(profile, values)
     moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
-    notes = _notes(coarse, fit, moving, excluded, observed, determined)
+    notes = _notes(coarse, fit, moving, joint.excluded, observed, determined)
     notes = (*notes, *(f"{calibrated(name).name} would be {reason}: that is implausible, so the given value was kept; "
                        "virest diagnose may find the real cause" for name, reason in beyond.items()))  # fmt: skip
     return GeometryCalibration(
@@ -385,6 +467,21 @@ def _drift_rad(fit: TrackFit, imu: ImuSamples) -> tuple[float, float]:
     span_s = float(np.ptp(fit.seconds)) / fit.scene.windows
     inverse_depth_per_m = float(np.median(np.linalg.norm(fit.scene.plane_per_m, axis=-1)))
     return drift_std_m(imu, span_s) * inverse_depth_per_m, max(span_s, 0.1)
+
+
+def _mistaken_rotation(joint: _Joint, coarse: CoarseAlignment) -> tuple[float, float]:
+    """Standard deviations of axes (rad) and gyroscope bias (rad/s) due to translation taken for rotation.
+
+    Without an accelerometer, yaw and pitch before a plane differ from translation by second-order terms only.  What the
+    fit leaves unexplained may thus be a rotation in every pair: at a constant rate, or in step with the camera's own.
+    """
+    observed = joint.observed
+    excess = residual_px(joint.fit) ** 2 - tracking_noise_px(observed, joint.fit) ** 2
+    turn_rad = max(excess, 0.0) ** 0.5 / observed.lens.fx_px
+    period_s = float(
+        np.median([observed.stamp_s[pair.second] - observed.stamp_s[pair.first] for pair in observed.pairs])
+    )
+    return turn_rad / coarse.motion_rad, turn_rad / period_s
 
 
 def _gyro_mean_std_rad_s(imu: ImuSamples, span_s: float) -> float:
@@ -413,7 +510,8 @@ def _notes(
     if isinstance(fit.scene, DirectedMotion):
         notes.append("the camera translates and there is no accelerometer: points were judged across their parallax")
     if excluded:
-        notes.append(f"{excluded:.0%} of the points lie in image regions that move independently and were excluded")
+        part = f"{excluded:.0%}" if excluded >= SMALL_PART else f"less than {SMALL_PART:.0%}"
+        notes.append(f"{part} of the points lie in image regions that move independently and were excluded")
     if moving > MANY_OUTLIERS:
         notes.append(f"{moving:.0%} of the tracks do not follow the camera (moving objects, or not a plane)")
     if not observed.exposure_known:

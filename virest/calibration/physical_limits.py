@@ -10,7 +10,11 @@ from virest.camera.profile import CameraProfile
 from virest.effects.table import CLOCK_SKEW_OFF, GYRO_SCALE_OFF
 
 LEAST_READOUT_S = 1e-3
-"""The fastest rolling shutters (stacked sensors, 960 frames/s) read a frame in about 1 ms; a global shutter has 0."""
+"""The fastest rolling shutters (stacked sensors, 960 frames/s) read a frame in about 1 ms."""
+GLOBAL_READOUT_S = 1e-4
+"""A fitted readout up to this, a tenth of any rolling shutter's, is that of a global shutter."""
+GLOBAL_SIGMA = 3.0
+"""So is one that lies within this many standard deviations of 0, if they exclude a rolling shutter."""
 FOCAL_OF_LONG_SIDE = (0.3, 10.0)
 """From an 11 mm ultra-wide to a 360 mm telephoto lens (35 mm equivalent), as a multiple of the image's long side."""
 DEPTH_M = (0.02, 1e4)
@@ -23,15 +27,22 @@ OFFSET_S = 2.0
 """A larger offset means another recording or another clock."""
 
 
+def is_global(readout_s: float, std_s: float = 0.0) -> bool:
+    """Whether a fitted readout is that of a global shutter: 0 within its standard deviation."""
+    margin_s = max(GLOBAL_SIGMA * std_s, GLOBAL_READOUT_S)
+    return abs(readout_s) <= margin_s < LEAST_READOUT_S
+
+
 def impossible(profile: CameraProfile, period_s: float, exposure_s: float) -> frozenset[str]:
     """Names of the effects whose values in a profile lie at or beyond their physical limits.
 
     period_s: between frames.  exposure_s: typical logged value; 0: unknown.  Readout and exposure must be shorter than
-    the period.  A readout below LEAST_READOUT_S, including 0, is no rolling shutter's.
+    the period.  A readout between a global shutter's and LEAST_READOUT_S is no camera's.
     """
     found = set()
     shutter, lens = profile.shutter, profile.intrinsics
-    if not LEAST_READOUT_S <= abs(shutter.readout_time_s) < period_s:
+    readout_s = abs(shutter.readout_time_s)
+    if not (LEAST_READOUT_S <= readout_s < period_s or is_global(readout_s)):
         found.add("readout_time")
     low, high = SCALE_OF_EXPOSURE
     true_exposure_s = exposure_s * shutter.exposure_scale

@@ -74,10 +74,11 @@ def plan_exposures(
 
 
 def light_path_ev(auto: AutoExposure, count: int, rng: np.random.Generator) -> Array:
-    """Log2 of the relative brightness (count,), spanning −range_ev / 2 to range_ev / 2."""
+    """Log2 of the relative brightness (count,), spanning −range_ev / 2 to range_ev / 2; 0 for a single frame."""
     if auto.steps is not None:
         step = np.arange(count) * auto.steps // count
-        return auto.range_ev * (step / max(int(step[-1]), 1) - 0.5)
+        last = int(step[-1])
+        return auto.range_ev * (step / last - 0.5) if last else np.zeros(count)
     phase = rng.uniform(0, 2 * np.pi, WALK_WAVES)
     periods = 0.6 * np.arange(1, WALK_WAVES + 1)
     along = np.arange(count) / max(count - 1, 1)

@@ -7,6 +7,7 @@ or not at all.
 from __future__ import annotations
 
 import json
+import math
 import os
 import secrets
 import shutil
@@ -353,12 +354,20 @@ def _write_effects(truth: Path, session: Session, applied: tuple[AppliedEffect, 
         "effects": [{"name": a.name, "parameters": a.parameters} for a in applied],
         "settings": {k: v for k, v in asdict(session.settings).items() if k != "isp" and (k != "auto_exposure" or v)},
         **({"isp": session.settings.isp.in_force()} if session.settings.isp.in_force() else {}),
-        "scene_plane": {
-            "depth_m": scene.depth_m if np.isfinite(scene.depth_m) else "inf",
-            "normal": list(scene.normal),
-        },
+        "scene_plane": {"depth_m": scene.depth_m, "normal": list(scene.normal)},
         "times": "seconds on the IMU clock from stamp_0",
         "slots": slots,
     }
-    text = json.dumps(content, indent=1, default=str).replace("Infinity", '"inf"')
+    text = json.dumps(_finite(content), indent=1, default=str, allow_nan=False)
     (truth / "effects.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _finite(value: Any) -> Any:
+    """A value that JSON can hold: infinities as the words of the contract, NaN as null."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    if not isinstance(value, float) or math.isfinite(value):
+        return value
+    return None if math.isnan(value) else "inf" if value > 0 else "-inf"

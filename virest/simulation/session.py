@@ -289,7 +289,7 @@ def sample_imu(session: Session) -> ImuLog:
         gyro = session.hidden.gyro(time_s, gyro, force)
     force = force + settings.accel_noise_m_s2 * rng.normal(size=force.shape)
     if settings.isp.gyro_jitter_s:
-        time_ns = jittered_ns(time_ns, settings.isp.gyro_jitter_s, np.random.default_rng([settings.seed, 7]))
+        time_ns = jittered_ns(time_ns, settings.isp.gyro_jitter_s, _jitter_rng(settings))
     return ImuLog(int(session.stamp_ns[0]) + time_ns, gyro, force)
 
 
@@ -472,6 +472,14 @@ def _corners_hz(session: Session) -> list[float]:
     """Corners of the hidden low-pass, whose delay stays in the log, and of the phone's own, whose delay is removed."""
     both = (session.true.extensions.gyro_lowpass_hz, session.settings.isp.gyro_lowpass_hz)
     return [corner_hz for corner_hz in both if corner_hz]
+
+
+def _jitter_rng(settings: SessionSettings) -> np.random.Generator:
+    """Random stream of the timestamp jitter; objects in front of the scene use the stream [seed, 7].
+
+    A trailing 0 leaves the stream [seed, 7] unchanged, so only captures with both draw from another.
+    """
+    return np.random.default_rng([settings.seed, 7, int(settings.near_m is not None)])
 
 
 def _gyro_noise(session: Session, shape: tuple[int, ...], rng: np.random.Generator) -> Array:

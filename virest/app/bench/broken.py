@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import traceback
 from collections.abc import Callable, Iterator
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from virest.app.bench.tables import table
-from virest.app.bench.workload import Scale, simulated
+from virest.app.bench.workload import Scale, real_captures, simulated
 from virest.app.calibrate import CalibrationOutput, plan_calibration, run_calibration
 from virest.app.diagnose import DiagnosisOptions, run_diagnosis
 from virest.errors import VirestError
@@ -46,9 +45,9 @@ def broken_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 
 
 def _measured() -> list[Path]:
-    """Available real captures (in the folder named by VIREST_REALDATA)."""
-    root = Path(os.environ.get("VIREST_REALDATA") or "/nonexistent")
-    return sorted(folder.parent for folder in root.glob("*/movie.mp4"))
+    """Available real captures."""
+    root = real_captures()
+    return [] if root is None else sorted(movie.parent for movie in root.glob("*/movie.mp4"))
 
 
 def outcomes(work: Path, source: Path, defect: Defect) -> dict[str, str]:

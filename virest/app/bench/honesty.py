@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.tables import table
+from virest.app.bench.tables import decibels, table
 from virest.app.bench.workload import Scale, Workload, honesty_workloads, run_process, simulated, truth_frame
 from virest.app.console import emit
 from virest.evaluation.fidelity import psnr_db
@@ -75,7 +75,7 @@ def frames_text(rows: Sequence[Row], presets: Sequence[str]) -> str:
         start = [row["capture"], str(row["frame"]), f"{row['blur_px']:.1f}", f"{row['straightened_db']:.2f}"]
         cells = lines.setdefault(row["frame"], start)
         mark = " !" if row["gain_db"] < -WORSE_DB else ""
-        cells.append(f"{_decibels(row['promise_db'])} / {_decibels(row['gain_db'])}{mark}")
+        cells.append(f"{decibels(row['promise_db'])} / {decibels(row['gain_db'])}{mark}")
     return table(header, list(lines.values()))
 
 
@@ -139,15 +139,11 @@ def _summary_cells(entry: Row) -> list[str]:
         entry["preset"],
         str(entry["of"]),
         str(entry["deblurred"]),
-        _decibels(entry["mean_gain_db"]),
+        decibels(entry["mean_gain_db"]),
         f"{100 * entry['worse_share']:.0f} %",
-        _decibels(entry["worse_mean_db"]),
-        _decibels(entry["worst_db"]),
+        decibels(entry["worse_mean_db"]),
+        decibels(entry["worst_db"]),
         str(entry["promised"]),
         off,
         str(entry["promised_and_worse"]),
     ]
-
-
-def _decibels(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.2f}"

@@ -6,9 +6,10 @@ import os
 import shutil
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, looped_capture, process_command
@@ -83,17 +84,32 @@ def peaks_of(command: list[str]) -> Peaks:
     counts, since before exec a new process still reports its parent's peak.
     """
     began = time.perf_counter()
-    together, own = 0, {}
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+    together: list[int] = []
+    own: dict[int, int] = {}
+
+    def sample(tree: list[int]) -> None:
+        together.append(sum(map(resident_bytes, tree)))
+        own.update({pid: peak for pid in tree if (peak := peak_bytes(pid))})
+
+    finished = run_sampled(command, sample, SAMPLE_S)
+    if finished.returncode:
+        raise subprocess.CalledProcessError(finished.returncode, command)
+    main = own.pop(finished.pid, 0)
+    return Peaks(max(together, default=0), main, max(own.values(), default=0), time.perf_counter() - began)
+
+
+def run_sampled(
+    command: list[str], sample: Callable[[list[int]], None], step_s: float, errors: IO[str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Run a command without its standard output and call ``sample`` with its process tree every ``step_s`` seconds.
+
+    errors: file for its standard error.  Returns the finished process.
+    """
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors) as process:
         while process.poll() is None:
-            tree = process_tree(process.pid)
-            together = max(together, sum(map(resident_bytes, tree)))
-            own.update({pid: peak for pid in tree if (peak := peak_bytes(pid))})
-            time.sleep(SAMPLE_S)
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, command)
-    main = own.pop(process.pid, 0)
-    return Peaks(together, main, max(own.values(), default=0), time.perf_counter() - began)
+            sample(process_tree(process.pid))
+            time.sleep(step_s)
+    return process
 
 
 def process_tree(root: int) -> list[int]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from virest.app.bench.peers import PEERS, frame_motions, peer_pictures
-from virest.app.bench.tables import table
+from virest.app.bench.tables import decibels, table
 from virest.app.bench.workload import (
     PRESETS,
     Scale,
@@ -115,9 +115,9 @@ def _text(summary: list[dict[str, Any]]) -> str:
     for entry in shown:
         name = entry["capture"] or f"ALL {KIND_TITLES[entry['kind']]}"
         straight = "-" if entry["straightened_db"] is None else f"{entry['straightened_db']:.2f}"
-        gains = [_decibels(entry["mean_gain_db"][method]) for method in METHODS]
+        gains = [decibels(entry["mean_gain_db"][method]) for method in METHODS]
         means.append([name, f"{entry['frames']}/{entry['of']}", straight, *gains])
-        minima.append([name, str(entry["of"]), *(_decibels(entry["min_gain_db"][preset]) for preset in PRESETS)])
+        minima.append([name, str(entry["of"]), *(decibels(entry["min_gain_db"][preset]) for preset in PRESETS)])
     return (
         "QUALITY: mean PSNR gain in dB over straightening alone, inside valid_px less 16 px\n"
         "(over the frames whose blur is in range; peers: true centre kernel, linear light,\n"
@@ -126,7 +126,3 @@ def _text(summary: list[dict[str, Any]]) -> str:
         + "\n\nthe same for the worst frame, at any blur\n"
         + table(["capture", "of", *PRESETS], minima)
     )
-
-
-def _decibels(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.2f}"

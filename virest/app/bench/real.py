@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from virest.app.bench.tables import table
-from virest.app.bench.workload import Scale, run_process
+from virest.app.bench.workload import Scale, real_captures, run_process
 from virest.app.calibrate import plan_calibration
 from virest.app.diagnose import climb_as_command, open_source
 from virest.calibration.geometry import calibrate_geometry
@@ -33,8 +32,8 @@ Row = list[str]
 
 def real_section(work: Path, _scale: Scale) -> tuple[dict[str, Any], str]:
     """Process, calibrate and diagnose the available captures."""
-    root = Path(os.environ.get("VIREST_REALDATA") or "/nonexistent")
-    if not root.is_dir():
+    root = real_captures()
+    if root is None:
         return {
             "skipped": "VIREST_REALDATA names no folder"
         }, "Measured captures: skipped, VIREST_REALDATA names no folder"

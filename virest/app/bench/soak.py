@@ -10,9 +10,7 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -20,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.memory import process_tree, resident_bytes
+from virest.app.bench.memory import resident_bytes, run_sampled
 from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, simulated
 
@@ -141,13 +139,14 @@ DEFECTS: dict[str, Callable[[Path], None]] = {
 
 def _monitored(command: list[str], log: Path) -> tuple[int, str, list[tuple[float, int]]]:
     """Exit code, standard error, and (bytes, open files) of the whole process tree, sampled 4 times per second."""
-    samples = []
-    with log.open("w") as file, subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file) as process:
-        while process.poll() is None:
-            tree = process_tree(process.pid)
-            samples.append((float(sum(map(resident_bytes, tree))), sum(map(_open_files, tree))))
-            time.sleep(SAMPLE_S)
-    return process.returncode, log.read_text(errors="replace"), samples
+    samples: list[tuple[float, int]] = []
+
+    def sample(tree: list[int]) -> None:
+        samples.append((float(sum(map(resident_bytes, tree))), sum(map(_open_files, tree))))
+
+    with log.open("w") as file:
+        code = run_sampled(command, sample, SAMPLE_S, file).returncode
+    return code, log.read_text(errors="replace"), samples
 
 
 def _open_files(pid: int) -> int:

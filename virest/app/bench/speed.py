@@ -115,9 +115,7 @@ def per_frame(shorter: Run, longer: Run, frames: int) -> Facts:
         "frames": [len(shorter.lines), len(longer.lines)],
         "wall_s": [shorter.wall_s, longer.wall_s],
         "s_per_frame": wall_s,
-        "blur_px": float(
-            np.median([line["blur"]["length_px"] for line in longer.lines if line["status"] != "skipped"])
-        ),
+        "blur_px": float(np.median([line["blur"]["length_px"] for line in done])),
         "frames_per_s": over(1.0, wall_s),
         "cpu_s_per_frame": cpu_s,
         "stage_s": stage_s,

@@ -13,3 +13,8 @@ def table(header: list[str], rows: list[list[str]]) -> str:
         return "  ".join(cells).rstrip()
 
     return "\n".join(line(row) for row in [header, *rows])
+
+
+def decibels(value: float | None) -> str:
+    """A gain as text, with its sign; ``-`` for None."""
+    return "-" if value is None else f"{value:+.2f}"

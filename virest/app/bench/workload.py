@@ -207,6 +207,12 @@ def simulated(work: Path, name: str, **options: Any) -> Path:
     return folder
 
 
+def real_captures() -> Path | None:
+    """The folder of real captures that VIREST_REALDATA names; None: it names no folder."""
+    named = os.environ.get("VIREST_REALDATA")
+    return Path(named) if named and Path(named).is_dir() else None
+
+
 # ── the program ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 

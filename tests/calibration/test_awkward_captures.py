@@ -1,0 +1,133 @@
+"""Calibrating captures that are unlike a phone's, or whose profile is far off."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from virest.app.calibrate import find_calibration, plan_calibration
+from virest.app.simulate import simulate_command
+from virest.calibration.geometry import calibrate_geometry
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import read_profile, write_profile
+from virest.capture.video import GrayReader, probe_movie
+from virest.errors import CalibrationError
+from virest.inference.guide_choice import track_guided
+
+LARGEST_SIGMA = 4.0
+SIZE = {"width": 320, "height": 240, "frames": 45, "exposure_ms": 6.0, "rate_rad_s": 1.2, "truth_frames": False}
+OFFSET_S = 0.012
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Simulate a capture once for all tests of this module: ``capture("name", readout_ms=0)`` gives its folder."""
+    root = tmp_path_factory.mktemp("awkward")
+
+    def made(name: str, *effects: str, **options: Any) -> Path:
+        if not (root / name).is_dir():
+            simulate_command(root / name, effects=[f"time_offset={OFFSET_S}", *effects], **{**SIZE, **options})
+        return root / name
+
+    return made
+
+
+def calibrated(folder: Path, *extra: str, config: Path | None = None) -> tuple[dict[str, Any], CameraProfile]:
+    """(mapping for ``--json``, calibrated profile)."""
+    facts, found, _ = find_calibration(plan_calibration(folder, config, extra))
+    return facts, found.profile
+
+
+def value_of(facts: dict[str, Any], name: str) -> dict[str, Any]:
+    """The value of a name."""
+    return next(dict(value) for value in facts["values"] if value["name"] == name)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_global_shutter_is_found(capture: Callable[..., Path], hidden: bool) -> None:
+    """Whether the profile states it or gives 20 ms: the readout is 0, has no direction, and the offset is right."""
+    folder = capture("wrong", "readout_time=0", seed=52) if hidden else capture("global", readout_ms=0.0, seed=51)
+    facts, profile = calibrated(folder)
+    readout, offset = value_of(facts, "readout_time_s"), value_of(facts, "time_offset_s")
+    assert facts["verdict"] == "calibrated"
+    assert (readout["value"], readout["determined"]) == (0.0, True)
+    assert 0 < readout["std"] < 3e-4
+    assert "readout_direction" not in {value["name"] for value in facts["values"]}
+    assert abs(offset["value"] - OFFSET_S) < LARGEST_SIGMA * offset["std"]
+    assert (profile.shutter.readout_time_s, profile.time_offset_s) == (0.0, offset["value"])
+    assert "readout_direction" not in profile.estimates
+    assert not [note for note in facts["notes"] if "implausible" in note]
+
+
+def without_accelerometer(folder: Path, out: Path) -> Path:
+    """A copy of a capture whose log has no accelerometer values."""
+    shutil.copytree(folder, out)
+    log = out / "gyro_accel.csv"
+    head, *rows = (line.split(",") for line in log.read_text().splitlines())
+    emptied = [[*row[:4], "null", "null", "null", *row[7:]] for row in rows]
+    log.write_text("\n".join(",".join(row) for row in [head, *emptied]) + "\n")
+    return out
+
+
+@pytest.mark.parametrize("seed", [72, 73])
+def test_travel_without_an_accelerometer_is_not_a_sure_gyro_bias(
+    capture: Callable[..., Path], tmp_path: Path, seed: int
+) -> None:
+    """Before a wall, yaw and pitch look like travel: the deviations of axes and bias contain it."""
+    folder = without_accelerometer(capture(f"wall-{seed}", depth_m=1.5, seed=seed), tmp_path / "gyro-only")
+    facts, profile = calibrated(folder)
+    assert facts["translation"] == "direction"
+    for name, true in (("rotation_rad", 0.0), ("gyro_bias_rad_s", 0.0), ("readout_time_s", 0.02)):
+        value = value_of(facts, name)
+        error = np.abs(np.subtract(value["value"], true))
+        assert (error < LARGEST_SIGMA * np.array(value["std"])).all(), name
+    assert np.abs(profile.gyro_bias_rad_s).max() < 0.006
+
+
+def wrong_focal(folder: Path, out: Path, factor: float) -> Path:
+    """A profile of the capture with another focal length."""
+    profile = read_profile(folder / "camera.yaml")
+    assert profile.intrinsics is not None
+    write_profile(replace(profile, intrinsics=profile.intrinsics.scaled_focal(factor)), out)
+    return out
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.8])
+def test_a_focal_length_far_off_is_found(capture: Callable[..., Path], tmp_path: Path, factor: float) -> None:
+    """Also where the frames do not seem to follow the gyroscope until it is scaled."""
+    folder = capture("plain", seed=53)
+    facts, _ = calibrated(folder, "focal", config=wrong_focal(folder, tmp_path / "wrong.yaml", factor))
+    focal, offset = value_of(facts, "fx_px"), value_of(facts, "time_offset_s")
+    assert facts["verdict"] == "calibrated"
+    assert focal["start"] == pytest.approx(256 * factor)
+    assert abs(focal["value"] - 256) < LARGEST_SIGMA * focal["std"]
+    assert abs(offset["value"] - OFFSET_S) < LARGEST_SIGMA * offset["std"]
+
+
+def test_a_focal_length_that_is_not_asked_for_is_suspected(capture: Callable[..., Path], tmp_path: Path) -> None:
+    """One line: what is seen, which focal length would explain it, and what to pass."""
+    folder = capture("plain", seed=53)
+    with pytest.raises(CalibrationError, match="do not follow") as refused:
+        calibrated(folder, config=wrong_focal(folder, tmp_path / "wrong.yaml", 1.8))
+    assert "--with focal" in str(refused.value.hint)
+    assert "0.5" in str(refused.value.hint)
+
+
+def test_drifting_clocks_are_fitted_as_if_asked_for(capture: Callable[..., Path]) -> None:
+    """The fit that goes on from a single offset ends where one with a skew from the start does."""
+    plan = plan_calibration(capture("drifting", "clock_skew=0.002", seed=54))
+    gray = GrayReader(plan.capture.movie, probe_movie(plan.capture.movie))
+    pairs = track_guided(plan.capture, plan.profile, gray, plan.frames)
+    unasked, asked = (calibrate_geometry(plan.capture, plan.profile, pairs, extra) for extra in ((), ("clock-skew",)))
+    assert "fitted too" in unasked.notes[0]
+    for one, other in zip(unasked.values, asked.values, strict=True):
+        assert (one.name, one.determined) == (other.name, other.determined)
+        if one.std is not None:
+            assert (np.abs(np.subtract(one.value, other.value)) < 0.1 * np.array(one.std)).all(), one.name
+            np.testing.assert_allclose(one.std, other.std, rtol=0.05)
