@@ -131,7 +131,8 @@ def test_blur_is_judged_on_blocks_that_it_was_not_fitted_to(monkeypatch: pytest.
     monkeypatch.setattr(local_blur_fit, "fit", lambda *a: fits.append(a[4]))
     monkeypatch.setattr(local_blur_fit, "judge", lambda *a: judged.append(a[3]) or 0.0)
     local_blur_fit.held_out(SimpleNamespace(time_s=time_s), CameraProfile(64, 48), None, ())  # type: ignore[arg-type]
-    assert len(fits) == len(judged) == 2
+    assert len(fits) == len(judged) == 4
+    assert np.array_equal(fits[0], ~fits[-1])
     for used, held in zip(fits, judged, strict=True):
         assert not np.any(used & held)
         assert np.all(used | held)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_evidence import depth_of
 from virest.diagnosis.geometric_verdict import Accepted, GeometricVerdict
@@ -23,6 +25,14 @@ def findings_of(verdict: GeometricVerdict) -> list[Finding]:
         sentence = _sentence(entry, changes)
         found.append(Finding(entry.name, changes, held_out, entry.rivals, entry.p_value, sentence))
     return sorted(found, key=lambda f: f.held_out.after**2 - f.held_out.before**2)
+
+
+def with_depth_of(findings: Sequence[Finding], profile: CameraProfile) -> CameraProfile:
+    """The profile with the depth found; during the fits, the scene is held beside the profile."""
+    for finding in findings:
+        if finding.name == "scene_depth":
+            return replace(profile, depth_m=float(finding.parameters["depth_m"].estimate))
+    return profile
 
 
 def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:
