@@ -225,7 +225,8 @@ class DiagnosisSession:
         """Judge blur unless point residuals are significant; blur distinguishes a wrong exposure from a time offset."""
         self.blur = PictureVerdict(self.light.profile)
         exposure_s = self.points.observed.exposure_s
-        change, is_exposure = exposure_hypothesis(self.findings, exposure_s, self.geometric.nominal.profile), False
+        change = exposure_hypothesis(self.findings, exposure_s, self.geometric.nominal.profile)
+        hypothesis, is_exposure = None if change is None else float(change.estimate), False
         if points_left(self.geometric).significant:
             self.notes.append(
                 "tracked points disagree with the model: blur and its effect on the curve were not judged"
@@ -234,7 +235,7 @@ class DiagnosisSession:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
             shown = replace(self.capture, frames=self._all_frames())
             self.blur, is_exposure = climb_blur(
-                shown, lit, integrate_gyro(self.capture.imu, lit), gray, change and change.estimate, self.each
+                shown, lit, integrate_gyro(self.capture.imu, lit), gray, hypothesis, self.each
             )
         if is_exposure and change is not None:
             exposure = as_exposure(self.findings, change)
