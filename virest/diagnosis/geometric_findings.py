@@ -15,6 +15,9 @@ from virest.diagnosis.geometric_verdict import Accepted, GeometricVerdict
 from virest.effects.table import EFFECTS
 from virest.inference.tracking_bias import bias_std
 
+UNKNOWN_FITTED = "virest diagnose, unknown before"
+"""Source of values that the given profile leaves open."""
+
 
 def findings_of(verdict: GeometricVerdict) -> list[Finding]:
     """The accepted causes as findings, strongest first."""
@@ -32,6 +35,22 @@ def with_depth_of(findings: Sequence[Finding], profile: CameraProfile) -> Camera
     for finding in findings:
         if finding.name == "scene_depth":
             return replace(profile, depth_m=float(finding.parameters["depth_m"].estimate))
+    return profile
+
+
+def with_unknowns_of(verdict: GeometricVerdict, profile: CameraProfile) -> CameraProfile:
+    """The profile with the given profile's unknown values that the fit determined, each with its deviation."""
+    for term in verdict.nominal.terms:
+        value = EFFECTS[term.name].calibrated
+        if value is None or term.name not in verdict.fit.slices:
+            continue
+        floor = bias_std(verdict.fit, term.name, verdict.step_noise_px)
+        std = float(np.hypot(verdict.fit.std(term.name), floor)[0])
+        found = value.read(replace(profile, readout_known=True))
+        if std < value.max_std and isinstance(found, float):
+            known = profile.readout_known or term.name == "readout_time"
+            std *= found if value.is_factor else 1.0
+            profile = profile.with_estimate(value.name, found, std, UNKNOWN_FITTED, readout_known=known)
     return profile
 
 

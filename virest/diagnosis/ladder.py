@@ -31,7 +31,7 @@ from virest.diagnosis.field.brightness import (
 )
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
-from virest.diagnosis.geometric_findings import findings_of, with_depth_of
+from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve, light_varies
@@ -312,6 +312,7 @@ class DiagnosisSession:
         stated = [entry for field in fields for entry in field.fields]
         with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in extended.fields]
         extended = extended.with_fields([held.rounded() for held in with_std])
+        extended = with_unknowns_of(self.geometric, extended)
         # the stabiliser's lean belongs to the start of this log: a restoration that begins later must not use it
         without_lean = replace(extended.extensions, stabilisation_lean_rad=(0.0, 0.0))
         stamps = sum(NO_STAMP not in frame.skip_codes for frame in self.capture.frames)
