@@ -132,6 +132,21 @@ def test_a_hidden_sharpening_is_named_with_its_size(processed):
     assert "unsharp" in finding.sentence
 
 
+def test_a_sharpening_among_the_estimates_is_no_new_cause(processed):
+    """As an extended profile records it; another mask than the recorded one is a change."""
+    source, trajectory = processed
+    (first,) = judged(*processed).findings
+    for factor, named in ((1.0, 0), (3.0, 1)):
+        profile = source.profile
+        for name, change in first.parameters.items():
+            profile = profile.with_estimate(name, factor * change.estimate, change.std, "virest diagnose, sharpening")
+        verdict = judged(replace(source, profile=profile), trajectory)
+        assert len(verdict.findings) == named
+        assert bool(verdict.notes) != bool(named)
+        for finding in verdict.findings:
+            assert finding.parameters["amount"].nominal == pytest.approx(3.0 * first.parameters["amount"].estimate)
+
+
 def test_sharpening_and_denoising_are_no_defocus_and_no_other_exposure(processed):
     """Nothing is named by the widths of edges and the ratios of spectra."""
     source, trajectory = processed

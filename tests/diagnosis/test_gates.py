@@ -25,7 +25,7 @@ from virest.diagnosis.candidates import Candidate
 from virest.diagnosis.catalogue import CATALOGUE, FALSE_ALARM, MAX_P
 from virest.diagnosis.cross_validation import Judged, Screened, choose
 from virest.diagnosis.cross_validation import judge as judge_points
-from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain, Rung
+from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain, ParameterChange, Rung
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import Trial, _best_single
@@ -131,7 +131,8 @@ def test_blur_is_judged_on_blocks_that_it_was_not_fitted_to(monkeypatch: pytest.
     monkeypatch.setattr(local_blur_fit, "fit", lambda *a: fits.append(a[4]))
     monkeypatch.setattr(local_blur_fit, "judge", lambda *a: judged.append(a[3]) or 0.0)
     local_blur_fit.held_out(SimpleNamespace(time_s=time_s), CameraProfile(64, 48), None, ())  # type: ignore[arg-type]
-    assert len(fits) == len(judged) == 2
+    assert len(fits) == len(judged) == 4
+    assert np.array_equal(fits[0], ~fits[-1])
     for used, held in zip(fits, judged, strict=True):
         assert not np.any(used & held)
         assert np.all(used | held)
@@ -324,6 +325,7 @@ def test_levels_are_asked_alike_of_all_evidence() -> None:
 @pytest.mark.parametrize(("name", "change"), [("exposure_time", 0.19), ("defocus", 1.0)])
 def test_blur_names_a_cause_by_the_probability_that_it_tells(name: str, change: float) -> None:
     """Deviations come from the scatter of a few blocks: four of them are too few, by Student's distribution."""
-    named = {z: picture_ladder._is_named(name, change, change / z) for z in (4.2, 12.0)}
+    value = ParameterChange(0.0, change, 0.0)
+    named = {z: picture_ladder._BlurChange(value, change, z).is_named(name) for z in (4.2, 12.0)}
     assert named == {4.2: False, 12.0: True}
     assert picture_ladder._blur_p_value(name, 4.2) > MAX_P

@@ -123,7 +123,7 @@ def test_gains_of_frames_that_no_patch_shows_are_unknown(rng: np.random.Generato
     observed = observed.subset(~rare)
     effect = GainDrift(tuple(range(FRAMES)), FRAMES)
     fit = fit_photometry(observed, NOMINAL, [effect])
-    assert significance(fit, "gain_drift", observed)[1] < 1e-6
+    assert significance(fit, "gain_drift", observed, NOMINAL)[1] < 1e-6
     std = np.sqrt(np.diag(fit.of("gain_drift")[1]))
     change = changes_of(values_of(effect, NOMINAL), values_of(effect, fit.profile), std, frames_of(fit))["gain"]
     assert len(change.estimate) == FRAMES

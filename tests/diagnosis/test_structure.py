@@ -20,7 +20,6 @@ def cloud(seed: int) -> tuple[Array, Array, dict[str, Array], Array]:
         "row": rng.uniform(0, 640, len(pair)),
         "radius": rng.rayleigh(150, len(pair)),
         "rate": rng.uniform(0.1, 2, PAIRS)[pair],
-        "time": pair / 30 + rng.uniform(0, 0.02, len(pair)),
     }
     return rng.normal(0, 0.2, (len(pair), 2)), rng.uniform(0.3, 1, len(pair)), covariates, pair
 
@@ -75,7 +74,6 @@ def test_what_differs_from_pair_to_pair_is_scatter() -> None:
     found = named(structures(values, weight, covariates, pair, FLOOR_PX))
     assert found["row"].p_value > 1e-3
     assert found["radius"].p_value > 1e-3
-    assert found["time"].p_value < 1e-6
 
 
 def test_means_below_the_floor_are_not_counted() -> None:

@@ -82,26 +82,32 @@ def _meaning(now: str, shift_s: float, exposure_s: float, std_s: float) -> str |
     return None
 
 
-def exposure_hypothesis(findings: Sequence[Finding], exposure_s: Array) -> float | None:
-    """The exposure scale that shifts the mid-exposure by the time offset found; None without such an offset."""
+def exposure_hypothesis(findings: Sequence[Finding], exposure_s: Array, given: CameraProfile) -> ParameterChange | None:
+    """The exposure scale that shifts the mid-exposure by the time offset found, instead of the given scale.
+
+    None without such an offset, and where timestamps mark the middle of the exposure, which no scale shifts.
+    """
     exposure = float(np.median(exposure_s))
+    shifted_by = exposure * (STAMP_FRACTION["exposure_middle"] - STAMP_FRACTION[given.shutter.timestamp])
+    if varies(exposure_s) or not shifted_by:
+        return None
     for finding in findings:
-        if finding.name == "time_offset" and not varies(exposure_s) and exposure > 0:
-            change = finding.parameters["time_offset_s"]
-            return 1.0 + 2.0 * (change.estimate - (change.nominal or 0.0)) / exposure
+        if finding.name == "time_offset":
+            change, scale = finding.parameters["time_offset_s"], given.shutter.exposure_scale
+            shift_s = change.estimate - (change.nominal or 0.0)
+            return ParameterChange(scale, scale + shift_s / shifted_by, float(change.std) / abs(shifted_by))
     return None
 
 
-def as_exposure(findings: Sequence[Finding], scale: float, exposure_s: float) -> Finding:
+def as_exposure(findings: Sequence[Finding], change: ParameterChange) -> Finding:
     """Attribute an offset to the exposure time, with its more precise value from the points."""
     finding = next(f for f in findings if f.name == "time_offset")
-    std = 2.0 * float(finding.parameters["time_offset_s"].std) / exposure_s
     return replace(
         finding,
         name="exposure_time",
-        parameters={"exposure_scale": ParameterChange(1.0, scale, std)},
+        parameters={"exposure_scale": change},
         rivals=(Rival("time_offset", finding.held_out.after),),
-        sentence=picture_ladder.SENTENCES["exposure_time"].format(exposure_scale=f"{scale:.3g}"),
+        sentence=picture_ladder.SENTENCES["exposure_time"].format(exposure_scale=f"{change.estimate:.3g}"),
     )
 
 
@@ -112,9 +118,8 @@ def one_exposure(blurred: picture_ladder.PictureVerdict) -> picture_ladder.Pictu
 
 
 def exposed(profile: CameraProfile, scale: float) -> CameraProfile:
-    """The profile with exposures scaled by a factor."""
-    shutter = profile.shutter
-    return replace(profile, shutter=replace(shutter, exposure_scale=shutter.exposure_scale * scale))
+    """The profile with this exposure scale."""
+    return replace(profile, shutter=replace(profile.shutter, exposure_scale=scale))
 
 
 def merged(

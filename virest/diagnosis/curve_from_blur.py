@@ -223,7 +223,8 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
         value = curve.extra_gamma * float(np.exp(change))
         return MixingEstimate(value, std * value, p_value, len(pairs))
     value = curve.black_level + change
-    return MixingEstimate(value, std, p_value if 0 < value <= evidence.largest_black else 1.0, len(pairs))
+    possible = -std < value <= evidence.largest_black
+    return MixingEstimate(max(value, 0.0), std, p_value if possible else 1.0, len(pairs))
 
 
 def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOutGain | None:

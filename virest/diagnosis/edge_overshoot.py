@@ -34,6 +34,7 @@ from virest.diagnosis.local_blur import STILL_PX, look_for_steps, time_blocks
 from virest.diagnosis.local_blur_model import across, path_tensors
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader
 from virest.diagnosis.selection import EDGE_LEVELS
+from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import RowClock
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
@@ -63,6 +64,8 @@ UNSHARPENED_RADII_PX = (0.6, 2.2)
 """Range of this overshoot: from that of interpolation to that of edges selected for sharpness."""
 SIZE_ERROR = 0.2
 """Relative error of amount and radius: coding damps the overshoot depending on frequency."""
+SAME_SIGMA = 3.0
+"""A mask that differs from the recorded one by fewer deviations is the same."""
 BOUNDS = ([0.2, 0.0, np.log(0.4)], [3.0, 6.0, np.log(4.0)])
 
 
@@ -117,6 +120,7 @@ def judge_sharpening(
 ) -> PictureVerdict:
     """Report sharpening where edges overshoot more than coding explains.
 
+    Restoration does not undo it, so the profile has no place for it; one that its estimates record is no new cause.
     steps: those of the frames of :func:`frames_to_read`, if already detected.
     """
     verdict = PictureVerdict(profile)
@@ -126,7 +130,13 @@ def judge_sharpening(
         verdict.notes.append("too few sharp, isolated edges: sharpening was not tested")
     elif EDGE_LEVELS.significant(found.p_value):
         values = {"amount": (found.amount, found.amount_std), "radius_px": (found.radius_px, found.radius_std_px)}
-        changes = {name: ParameterChange(0.0, value, std) for name, (value, std) in values.items()}
+        known = EFFECTS["sharpening"].read(profile, profile)
+        changes = {name: ParameterChange(known[name], *found_so) for name, found_so in values.items()}
+        if known["amount"] and all(abs(c.estimate - c.nominal) < SAME_SIGMA * c.std for c in changes.values()):
+            verdict.notes.append(
+                f"the phone sharpens its frames by an unsharp mask of {found.amount:.2g}, as the estimates record"
+            )
+            return verdict
         sentence = (
             f"edges overshoot by {found.overshoot:.0%} of their step: the phone sharpened its frames with an unsharp "
             f"mask (amount {found.amount:.2g}, radius {found.radius_px:.2g} px)"

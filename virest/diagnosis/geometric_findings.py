@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_evidence import depth_of
 from virest.diagnosis.geometric_verdict import Accepted, GeometricVerdict
 from virest.effects.table import EFFECTS
 from virest.inference.tracking_bias import bias_std
+
+UNKNOWN_FITTED = "virest diagnose, unknown before"
+"""Source of values that the given profile leaves open."""
 
 
 def findings_of(verdict: GeometricVerdict) -> list[Finding]:
@@ -23,6 +28,30 @@ def findings_of(verdict: GeometricVerdict) -> list[Finding]:
         sentence = _sentence(entry, changes)
         found.append(Finding(entry.name, changes, held_out, entry.rivals, entry.p_value, sentence))
     return sorted(found, key=lambda f: f.held_out.after**2 - f.held_out.before**2)
+
+
+def with_depth_of(findings: Sequence[Finding], profile: CameraProfile) -> CameraProfile:
+    """The profile with the depth found; during the fits, the scene is held beside the profile."""
+    for finding in findings:
+        if finding.name == "scene_depth":
+            return replace(profile, depth_m=float(finding.parameters["depth_m"].estimate))
+    return profile
+
+
+def with_unknowns_of(verdict: GeometricVerdict, profile: CameraProfile) -> CameraProfile:
+    """The profile with the given profile's unknown values that the fit determined, each with its deviation."""
+    for term in verdict.nominal.terms:
+        value = EFFECTS[term.name].calibrated
+        if value is None or term.name not in verdict.fit.slices:
+            continue
+        floor = bias_std(verdict.fit, term.name, verdict.step_noise_px)
+        std = float(np.hypot(verdict.fit.std(term.name), floor)[0])
+        found = value.read(replace(profile, readout_known=True))
+        if std < value.max_std and isinstance(found, float):
+            known = profile.readout_known or term.name == "readout_time"
+            std *= found if value.is_factor else 1.0
+            profile = profile.with_estimate(value.name, found, std, UNKNOWN_FITTED, readout_known=known)
+    return profile
 
 
 def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, ParameterChange]:

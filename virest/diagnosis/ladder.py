@@ -31,7 +31,7 @@ from virest.diagnosis.field.brightness import (
 )
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
-from virest.diagnosis.geometric_findings import findings_of
+from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve, light_varies
@@ -58,6 +58,7 @@ from virest.inference.recorder_lag import lag_schedules
 from virest.inference.tracking import track_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.scene_motion import InertialMotion
+from virest.restoration.capture import at_true_times
 
 Progress = Callable[[str, float], None]
 MOST_TRAVEL_PX = 0.35
@@ -81,6 +82,7 @@ def diagnose_capture(
     """
     report = progress or (lambda _text, _part: None)
     report("tracking", 0.02)
+    capture = replace(capture, frames=at_true_times(capture.frames, profile, capture.repeats))
     points, notes = _tracked(capture, profile, gray, each, frozenset(kept_back))
     report("points", 0.15)
     first = points.climbed(lambda part: report("points", 0.15 + 0.35 * part))
@@ -223,23 +225,25 @@ class DiagnosisSession:
         """Judge blur unless point residuals are significant; blur distinguishes a wrong exposure from a time offset."""
         self.blur = PictureVerdict(self.light.profile)
         exposure_s = self.points.observed.exposure_s
-        scale, is_exposure = exposure_hypothesis(self.findings, exposure_s), False
+        change = exposure_hypothesis(self.findings, exposure_s, self.geometric.nominal.profile)
+        hypothesis, is_exposure = None if change is None else float(change.estimate), False
         if points_left(self.geometric).significant:
             self.notes.append("tracked points disagree with the model: blur and the exposure curve were not tested")
         else:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
             shown = replace(self.capture, frames=self._all_frames())
             self.blur, is_exposure = climb_blur(
-                shown, lit, integrate_gyro(self.capture.imu, lit), gray, scale, self.each
+                shown, lit, integrate_gyro(self.capture.imu, lit), gray, hypothesis, self.each
             )
-        if is_exposure and scale is not None:
-            exposure = as_exposure(self.findings, scale, float(np.median(exposure_s)))
-            points = replace(self.points, start=exposed(self.points.start, scale))
+        if is_exposure and change is not None:
+            exposure = as_exposure(self.findings, change)
+            points = replace(self.points, start=exposed(self.points.start, change.estimate))
             self.geometric = points.described(points.climbed(progress), self.light.profile)
             self.findings = [exposure, *offset_as_timestamp(self.geometric, findings_of(self.geometric), exposure_s)]
         if any(finding.name == "exposure_time" for finding in self.findings):
             self.blur, is_exposure = one_exposure(self.blur), True
-        extended = merged(self.geometric.model.profile, self.light.profile, self.blur.profile, is_exposure)
+        moved = with_depth_of(self.findings, self.geometric.model.profile)
+        extended = merged(moved, self.light.profile, self.blur.profile, is_exposure)
         self.curve = PictureVerdict(extended)
 
     def judge_curve(self, pictures: Reader) -> None:
@@ -285,7 +289,7 @@ class DiagnosisSession:
         fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
         extended, light = self.curve.profile, self.light
         if (patches := light.observations) is not None:
-            name, without, instead = instead_of_cause(patches, extended)
+            name, without, instead = instead_of_cause(patches, extended, {finding.name for finding in findings})
             if instead is not None:
                 extended, light = without(extended), replace(light, profile=without(light.profile))
                 findings = [finding for finding in findings if finding.name != name]
@@ -296,13 +300,17 @@ class DiagnosisSession:
             trajectory = integrate_gyro(self.capture.imu, extended)
             if (soft := blur_field(self.blur.edges, extended, trajectory, self.capture)) is not None:
                 fields, extended = [*fields, soft[0]], soft[1]
-                if not BLUR_LEVELS.matters("defocus", extended.extensions.defocus_sigma_px):  # no uniform blur left
+                uniform_px = (
+                    extended.extensions.defocus_sigma_px - self.first.nominal.profile.extensions.defocus_sigma_px
+                )
+                if not BLUR_LEVELS.matters("defocus", abs(uniform_px)):  # the field explains the blur
                     findings = [finding for finding in findings if finding.name != "defocus"]
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
         stated = [entry for field in fields for entry in field.fields]
         with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in extended.fields]
         extended = extended.with_fields([held.rounded() for held in with_std])
+        extended = with_unknowns_of(self.geometric, extended)
         # the stabiliser's lean belongs to the start of this log: a restoration that begins later must not use it
         without_lean = replace(extended.extensions, stabilisation_lean_rad=(0.0, 0.0))
         stamps = sum(NO_STAMP not in frame.skip_codes for frame in self.capture.frames)

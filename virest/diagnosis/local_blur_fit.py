@@ -198,10 +198,12 @@ def held_out(
     observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory, effects: Sequence[BlurEffect]
 ) -> HeldOutGain:
     """Robust rms, px, without and with the effects, fitted to every other time block and judged on the rest."""
-    even, odd = halves(time_blocks(observations.time_s))
-    before, after = (fit(observations, profile, trajectory, chosen, even) for chosen in ((), effects))
-    before_px, after_px = (judge(observations, one, trajectory, odd) for one in (before, after))
-    return HeldOutGain(BLUR, before_px, after_px, None)
+    folds = []
+    for fitted in halves(time_blocks(observations.time_s)):
+        fits = [fit(observations, profile, trajectory, chosen, fitted) for chosen in ((), effects)]
+        before_px, after_px = (judge(observations, one, trajectory, ~fitted) for one in fits)
+        folds.append((before_px, after_px, 0.0))
+    return replace(HeldOutGain.of_folds(BLUR, folds), noise=None)
 
 
 @dataclass(frozen=True, slots=True)

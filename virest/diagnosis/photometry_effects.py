@@ -146,12 +146,10 @@ class Flicker:
         return np.array([0.05, 0.1, 0.1])
 
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """Highest peaks of the scan over frequency."""
-        ext = profile.extensions
-        if ext.flicker_amplitude:
-            return [np.array([ext.flicker_amplitude, ext.flicker_frequency_hz, ext.flicker_phase_rad])]
-        scan = scan_flicker(observations, profile, self.search_hz)
-        return [scan.start(i) for i in scan.peaks(self.candidates)] or [np.array([0.0, 100.0, 0.0])]
+        """The profile's flicker, and the highest peaks of the scan over frequency."""
+        own = [_flicker_of(profile)] if profile.extensions.flicker_amplitude else []
+        scan = scan_flicker(observations, extended(profile, flicker_amplitude=0.0), self.search_hz)
+        return [*own, *(scan.start(i) for i in scan.peaks(self.candidates))] or [np.array([0.0, 100.0, 0.0])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set the flicker extensions; a negative amplitude is a positive one half a period later."""
@@ -163,6 +161,20 @@ class Flicker:
             flicker_frequency_hz=frequency,
             flicker_phase_rad=phase,
         )
+
+
+def _flicker_of(profile: CameraProfile) -> Array:
+    """(amplitude, frequency, phase)."""
+    ext = profile.extensions
+    return np.array([ext.flicker_amplitude, ext.flicker_frequency_hz, ext.flicker_phase_rad])
+
+
+def flicker_change(given: CameraProfile, values: Array) -> Array:
+    """Change (3,) of amplitude, frequency and phase between a profile's flicker and fitted values."""
+    amplitude, frequency, phase = values - _flicker_of(given)
+    if values[0] < 0:
+        amplitude, phase = amplitude - 2 * values[0], phase + np.pi
+    return np.array([amplitude, frequency, (phase + np.pi) % (2 * np.pi) - np.pi])
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,8 @@ from virest.diagnosis.photometry import (
     normalised_rms,
     predict,
 )
-from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect
+from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, flicker_change
+from virest.effects.table import EFFECTS
 from virest.inference.chance import chi2_tail, normal_deviate
 from virest.inference.clustered import raised, scatter
 from virest.inference.descent import Residuals, Slopes, System, descend, slices, slopes_by_steps
@@ -180,40 +181,52 @@ def _sides(observations: PhotometricObservations) -> list[Mask]:
     return [side for half in lower for side in (half, ~half)]
 
 
-def significance(fit: PhotometricFit, effect_name: str, observations: PhotometricObservations) -> tuple[float, float]:
-    """(normal deviate equivalent to the p value, p value of no effect); includes RESOLUTION and frequency search."""
+def significance(
+    fit: PhotometricFit, effect_name: str, observations: PhotometricObservations, given: CameraProfile
+) -> tuple[float, float]:
+    """(normal deviate equivalent to the p value, p value of no change); includes RESOLUTION and frequency search.
+
+    given: the profile that the change is counted from.
+    """
     values, covariance = fit.of(effect_name)
-    if effect_name == "flicker":
+    if effect_name == "flicker" and given.extensions.flicker_amplitude:
+        change = flicker_change(given, values)
+        p = chi2_tail(float(change @ np.linalg.solve(covariance, change)), len(change))
+    elif effect_name == "flicker":
         z2 = values[0] ** 2 / covariance[0, 0]
         span_s = float(np.ptp(observations.stamp_s))
         trials = max(380.0 * span_s, 1.0)
         p = float(-np.expm1(trials * np.log1p(-min(np.exp(-0.5 * z2), 1 - 1e-12))))
     elif effect_name == "gain_drift":
         (gains,) = (effect for effect in fit.effects if isinstance(effect, GainDrift))
-        p = _p_of_gains(observations.subset(np.isin(observations.frame, gains.frames)), values, covariance)
+        (before,) = gains.starts(observations, given)
+        seen = observations.subset(np.isin(observations.frame, gains.frames))
+        p = _p_of_gains(seen, values, before, covariance)
     else:
-        off = values[0] - (1.0 if effect_name == "response_curve" else 0.0)
-        z2 = off**2 / covariance[0, 0]
-        p = chi2_tail(z2, 1)
+        (before,) = EFFECTS[effect_name].read(given, given).values()
+        p = chi2_tail((values[0] - before) ** 2 / covariance[0, 0], 1)
     return normal_deviate(max(p, 1e-300) / 2), p
 
 
-def _p_of_gains(observations: PhotometricObservations, log_gain: Array, covariance: Array) -> float:
-    """p value of a constant gain, given the errors of the gains, and of curve and encoder where exposure × ISO changes.
+def _p_of_gains(observations: PhotometricObservations, log_gain: Array, before: Array, covariance: Array) -> float:
+    """p value of gains that changed alike, given their errors, and those of curve and encoder under changing exposure.
 
-    Frames of one time block share errors, so each block counts once.  Shared errors cancel from one frame to the next,
-    so fast changes are tested separately; neighbouring changes share a frame, so one third of them count.
+    before: logarithms (k,) of the gains that the change is counted from.  Frames of one time block share errors, so
+    each block counts once.  Shared errors cancel from one frame to the next, so fast changes are tested separately;
+    neighbouring changes share a frame, so one third of them count.
     """
     product = _per_frame(observations, observations.log_product)
     rounding = _per_frame(observations, observations.log_product_std)
     late = product - _frames_before(product, 1)
     followed = np.stack([CURVE_ERROR * product, CURVE_ERROR * product**2, DELAY_FRAMES * late], axis=-1)
     spread = covariance + followed @ followed.T + np.diag(rounding**2)
-    off = log_gain - np.mean(log_gain)
+    change = log_gain - before
+    off = change - np.mean(change)
     freedom = max(len(off) - 1, 1)
     blocks = min(len(np.unique(time_blocks(observations))), freedom)
     slow = float(off @ np.linalg.solve(spread, off)) / freedom
-    quick = _quick_changes(log_gain, spread - _lag_of_gains(log_gain, np.abs(late)))
+    unchanged = spread - _lag_of_gains(log_gain, np.abs(late)) + _lag_of_gains(before, np.abs(late))
+    quick = _quick_changes(change, unchanged)
     tests = ((slow, blocks), (quick, max(freedom / CORRELATED_CHANGES, 1.0)))
     return float(min(1.0, 2 * min(chi2_tail(ratio * count, count) for ratio, count in tests)))
 

@@ -58,12 +58,20 @@ class PatchSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class _Corners:
+    """Corners of a frame, to be found in other frames."""
+
+    frame: Frame
+    normal: Picture
+    points_px: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
 class _Key:
     """A key frame with the patches and corners to be found in other frames."""
 
     frame: Frame
-    normal: Picture
-    corners_px: NDArray[np.float32]
+    corners: _Corners
     patches_px: Array
     spread: Array
     first_place: int
@@ -161,13 +169,18 @@ def _patch_maps(picture: Picture, settings: PatchSettings) -> _PatchMaps:
     side, wide = _odd(settings.patch_px * scale), _odd(settings.surround_px * scale)
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
     squared = gray * gray
-    near, far, around = ((n, n) for n in (side, wide, _odd(41 * scale)))
+    near, far = (side, side), (wide, wide)
     mean = cv2.boxFilter(picture, cv2.CV_32F, near, borderType=cv2.BORDER_REFLECT)
     spread = _spread(gray, squared, near)
-    local = cv2.blur(gray, around)
-    contrast = np.sqrt(np.maximum(cv2.blur(squared, around) - local * local, 0)) + 6.0
-    normal = np.clip(128 + 45 * (gray - local) / contrast, 0, 255).astype(np.uint8)
-    return _PatchMaps(np.asarray(mean, np.float32), spread, _spread(gray, squared, far), normal)
+    return _PatchMaps(np.asarray(mean, np.float32), spread, _spread(gray, squared, far), _normalised(gray))
+
+
+def _normalised(gray: NDArray[np.float32]) -> Picture:
+    """Grey levels at equal local brightness and contrast, for tracking."""
+    side = _odd(41 * _scale(gray.shape[1], gray.shape[0]))
+    local = cv2.blur(gray, (side, side))
+    contrast = np.sqrt(np.maximum(cv2.blur(gray * gray, (side, side)) - local * local, 0)) + 6.0
+    return np.clip(128 + 45 * (gray - local) / contrast, 0, 255).astype(np.uint8)
 
 
 def _spread(gray: NDArray[np.float32], squared: NDArray[np.float32], box: tuple[int, int]) -> NDArray[np.float32]:
@@ -175,11 +188,15 @@ def _spread(gray: NDArray[np.float32], squared: NDArray[np.float32], box: tuple[
     return np.asarray(np.sqrt(np.maximum(cv2.blur(squared, box) - mean * mean, 0)), np.float32)
 
 
+def _corners(frame: Frame, normal: Picture) -> _Corners:
+    return _Corners(frame, normal, find_corners(normal, TrackingSettings(grid=(7, 7), points_per_cell=3)))
+
+
 def _make_key(frame: Frame, maps: _PatchMaps, first_place: int, settings: PatchSettings) -> _Key:
-    corners = find_corners(maps.normal, TrackingSettings(grid=(7, 7), points_per_cell=3))
     patches = _flat_patches(maps, settings)
     column, row = patches[:, 0].astype(int), patches[:, 1].astype(int)
-    return _Key(frame, maps.normal, corners, patches, maps.spread[row, column].astype(float), first_place)
+    spread = maps.spread[row, column].astype(float)
+    return _Key(frame, _corners(frame, maps.normal), patches, spread, first_place)
 
 
 def _flat_patches(maps: _PatchMaps, settings: PatchSettings) -> Array:
@@ -220,9 +237,7 @@ def _seen_patches(
     settings: PatchSettings,
 ) -> Array:
     """Read the patches of a key frame in another frame; empty if the frames cannot be registered."""
-    corners = key.corners_px.astype(float)
-    guess = predicted_points(corners, key.frame, frame, camera)
-    field = _deviation(key, guess, maps, settings)
+    field = _deviation(key.corners, frame, maps.normal, camera, settings)
     if field is None:
         return np.zeros((0, 8))
     patches = predicted_points(key.patches_px, key.frame, frame, camera)
@@ -253,11 +268,8 @@ def registered_points(
     at: GrayFrame, other: GrayFrame, camera: TurningCamera, points_px: Array
 ) -> NDArray[np.float32] | None:
     """Positions (..., 2) in another frame of points (..., 2), corrected by tracked corners; None if those fail."""
-    settings = PatchSettings()
-    both_maps = [_patch_maps(cv2.cvtColor(one.gray, cv2.COLOR_GRAY2RGB), settings) for one in (at, other)]
-    key = _make_key(at.frame, both_maps[0], 0, settings)
-    guess = predicted_points(key.corners_px.astype(float), at.frame, other.frame, camera)
-    field = _deviation(key, guess, both_maps[1], settings)
+    here, there = (_normalised(one.gray.astype(np.float32)) for one in (at, other))
+    field = _deviation(_corners(at.frame, here), other.frame, there, camera, PatchSettings())
     if field is None:
         return None
     height, width = at.gray.shape
@@ -274,15 +286,18 @@ def path_over_exposure(points_px: Array, frame: Frame, camera: TurningCamera, in
     return moved_between(at, points_px, at.row_time_s(points_px, ROW_MIDDLE), time_s) - points_px
 
 
-def _deviation(key: _Key, guess: Array, maps: _PatchMaps, settings: PatchSettings) -> Array | None:
-    """Smooth field (6, 2) of tracked − predicted corners: quadratic in position, robust; None if too few agree."""
-    height, width = maps.normal.shape
+def _deviation(
+    corners: _Corners, frame: Frame, normal: Picture, camera: TurningCamera | None, settings: PatchSettings
+) -> Array | None:
+    """Smooth field (6, 2) of tracked − predicted corners in a frame: quadratic in position; None if too few agree."""
+    height, width = normal.shape
+    guess = predicted_points(corners.points_px.astype(float), corners.frame, frame, camera)
     inside = ((guess > 0) & (guess < (width - 1, height - 1))).all(axis=-1)
     if inside.sum() < settings.min_corners:
         return None
     start = np.ascontiguousarray(guess[inside, None], np.float32)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        key.normal, maps.normal, np.ascontiguousarray(key.corners_px[inside, None]), start.copy(),
+        corners.normal, normal, np.ascontiguousarray(corners.points_px[inside, None]), start.copy(),
         winSize=_LK_WINDOW, maxLevel=_LK_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     found = status.ravel() == 1

@@ -82,11 +82,14 @@ class PictureVerdict:
     """Result of the ladder for brightness, blur, curve or edges."""
 
     profile: CameraProfile
+    """With the causes found."""
     findings: list[Finding] = field(default_factory=list)
     rungs: list[Rung] = field(default_factory=list)
     observations: PhotometricObservations | None = None
     fitted: PhotometricFit | None = None
     """Joint fit of all accepted causes of brightness."""
+    nominal: CameraProfile | None = None
+    """The profile without them; None: not judged."""
     mixed: dict[str, Mixed] = field(default_factory=dict)
     """By cause: change of the curve estimated from blur, reported or not."""
     photometric_rms: float | None = None
@@ -170,7 +173,7 @@ def climb_observations(
     verdict: PictureVerdict, observations: PhotometricObservations, movie_frames: int, each: ParallelMap = one_by_one
 ) -> None:
     """Add to the verdict the causes that the brightness of patches shows."""
-    nominal = verdict.profile
+    nominal = verdict.nominal = verdict.profile
     verdict.photometric_rms = normalised_rms(observations, nominal)[0]
     effects = photometric_effects(observations, movie_frames)
     if not light_varies(observations):
@@ -226,7 +229,7 @@ def _rung(
     nothing = Rung(None, tried, before, PHOTOMETRY)
     for name in order[:2]:
         effect = next(e for e in effects if e.name == name)
-        p_value = significance(fits[name], name, observations)[1]
+        p_value = significance(fits[name], name, observations, nominal)[1]
         low_memory = name not in CURVE or fits[name].memory <= MAX_CURVE_MEMORY
         if fits[name].cost >= plain.cost or not LIGHT_LEVELS.significant(p_value) or not low_memory:
             continue
@@ -262,7 +265,7 @@ def _still_needed(
 ) -> tuple[list[PhotometricEffect], PhotometricFit]:
     """Drop causes that the newest one makes superfluous: free gains absorb any change of brightness."""
     for effect in accepted[:-1]:
-        if not LIGHT_LEVELS.significant(significance(fitted, effect.name, observations)[1]):
+        if not LIGHT_LEVELS.significant(significance(fitted, effect.name, observations, nominal)[1]):
             accepted = [other for other in accepted if other is not effect]
             fitted = fit_photometry(observations, nominal, accepted)
     return accepted, fitted
@@ -277,7 +280,7 @@ def _finding(
 ) -> Finding:
     std = np.sqrt(np.diag(fitted.of(effect.name)[1]))
     changes = changes_of(values_of(effect, nominal), values_of(effect, fitted.profile), std, frames_of(fitted))
-    p_value = significance(fitted, effect.name, observations)[1]
+    p_value = significance(fitted, effect.name, observations, nominal)[1]
     return Finding(effect.name, changes, held, (), p_value, sentence_of(effect.name, changes))
 
 
@@ -294,7 +297,7 @@ def frames_of(fitted: PhotometricFit) -> Sequence[int]:
 def changes_of(
     before: dict[str, Any], now: dict[str, Any], std: Array, frames: Sequence[int] = ()
 ) -> dict[str, ParameterChange]:
-    """Values before and after, with standard deviations; a gain starts from 1 in every frame.
+    """Values before and after, with standard deviations; a gain is 1 in frames that the profile does not list.
 
     frames: movie indices to which the deviations of a gain belong; those of other frames, which take the gain of their
     neighbours, are unknown (NaN).
@@ -303,7 +306,8 @@ def changes_of(
         gain = now["gain"]
         spread = np.full(len(gain), np.nan)
         spread[np.asarray(frames, np.intp)] = std
-        return {"gain": ParameterChange([1.0] * len(gain), gain, spread.tolist())}
+        given = [*before["gain"], *[1.0] * len(gain)][: len(gain)]
+        return {"gain": ParameterChange(given, gain, spread.tolist())}
     return {name: ParameterChange(before[name], now[name], float(s)) for name, s in zip(now, std, strict=True)}
 
 
@@ -364,7 +368,7 @@ def _is_supported(found: Mixed, name: str, profile: CameraProfile) -> bool:
     """Whether a change of the curve is significant, large enough, and gains on held-out pairs."""
     estimate, held = found
     (now,) = values_of(CURVE[name], profile).values()
-    size = estimate.value - now if name == "black_level" else abs(np.log(estimate.value / now))
+    size = abs(estimate.value - now if name == "black_level" else np.log(estimate.value / now))
     levels = MIXING_LEVELS
     return levels.significant(estimate.p_value) and levels.matters(name, float(size)) and levels.gains(held)
 
@@ -399,37 +403,61 @@ def climb_blur(
     log.debug("blur: %s ± %s", fitted.values, fitted.std)
     everything = np.ones(len(observations), bool)
     verdict.blur_rms_px = local_blur_fit.judge(observations, plain, trajectory, everything)
-    is_exposure = _exposure_holds(fitted, exposure_hypothesis)
-    named = []
-    scale, sigma = float(fitted.values[0][0]), float(fitted.values[1][0])
-    std = fitted.std
-    if fitted.determined[0] and (is_exposure or _is_named("exposure_time", abs(np.log(scale)), float(std[0]) / scale)):
-        named.append(0)
-    if fitted.determined[1] and _is_named("defocus", sigma, float(std[1])):
-        named.append(1)
-    if 1 not in named and fitted.determined[1] and sigma > SOFT_Z * float(std[1]):
-        soft = float(np.hypot(sigma, fitted.nuisance[0]))
+    is_exposure = _exposure_holds(fitted, profile.shutter.exposure_scale, exposure_hypothesis)
+    found = _blur_changes(fitted, profile)
+    named = [
+        k
+        for k, effect in enumerate(effects)
+        if fitted.determined[k] and ((k == 0 and is_exposure) or found[k].is_named(effect.name))
+    ]
+    defocus = found[1].parameter
+    if 1 not in named and fitted.determined[1] and defocus.estimate - defocus.nominal > SOFT_Z * defocus.std:
+        soft = float(np.hypot(defocus.estimate, fitted.nuisance[0]))
         verdict.notes.append(
-            f"edges are blurred by {soft:.2f} px: a soft lens, or a defocus of about {sigma:.1f} px; "
+            f"edges are blurred by {soft:.2f} px: a soft lens, or a defocus of about {defocus.estimate:.1f} px; "
             "not reported as a cause"
         )
-    for k in named:
-        alone = tuple(effects[j] for j in named)
-        held = local_blur_fit.held_out(observations, profile, trajectory, alone)
-        changes = _blur_change(k, profile, scale, sigma, std)
-        z = float(abs(np.log(scale)) * scale / std[0] if k == 0 else sigma / std[1])
-        name = effects[k].name
-        p_value = _blur_p_value(name, z)
-        verdict.findings.append(Finding(name, changes, held, (), p_value, sentence_of(name, changes)))
-        verdict.rungs.append(Rung(name, {name: held.after}, held.before, BLUR))
-        values = np.array([scale]) if k == 0 else np.array([sigma])
-        verdict.profile = effects[k].apply(verdict.profile, values)
+    if named:
+        held = local_blur_fit.held_out(observations, profile, trajectory, tuple(effects[k] for k in named))
+        for k in named:
+            name, change = effects[k].name, found[k].parameter
+            changes = {effects[k].parameters[0]: change}
+            p_value = _blur_p_value(name, found[k].deviations)
+            verdict.findings.append(Finding(name, changes, held, (), p_value, sentence_of(name, changes)))
+            verdict.rungs.append(Rung(name, {name: held.after}, held.before, BLUR))
+            verdict.profile = effects[k].apply(verdict.profile, np.array([change.estimate]))
     return verdict, is_exposure
 
 
-def _is_named(name: str, change: float, std: float) -> bool:
-    """Whether a change found in blur is large enough, and significant by the reported p value."""
-    return BLUR_LEVELS.matters(name, change) and BLUR_LEVELS.significant(_blur_p_value(name, change / std))
+@dataclass(frozen=True, slots=True)
+class _BlurChange:
+    """A value that the blur shows, beside the profile's."""
+
+    parameter: ParameterChange
+    size: float
+    """Absolute change: of the logarithm of the exposure, of the defocus in px."""
+    deviations: float
+    """The change in standard deviations."""
+
+    def is_named(self, name: str) -> bool:
+        """Whether the change is large enough, and significant by the reported p value."""
+        significant = BLUR_LEVELS.significant(_blur_p_value(name, self.deviations))
+        return BLUR_LEVELS.matters(name, self.size) and significant
+
+
+def _blur_changes(fitted: local_blur_fit.BlurFit, given: CameraProfile) -> tuple[_BlurChange, _BlurChange]:
+    """The changes of exposure and defocus; NaN where the capture does not determine a value.
+
+    A small defocus hardly widens edges, so a defocus below the given one is tested by its variance in px².
+    """
+    (scale, sigma), (scale_std, sigma_std) = np.concatenate(fitted.values).tolist(), fitted.std.tolist()
+    before, sharp = given.shutter.exposure_scale, given.extensions.defocus_sigma_px
+    longer = abs(float(np.log(scale / before)))
+    wider = (sigma - sharp) / sigma_std if sigma >= sharp else (sharp**2 - sigma**2) / (2 * sigma * sigma_std)
+    return (
+        _BlurChange(ParameterChange(before, scale, scale_std), longer, longer * scale / scale_std),
+        _BlurChange(ParameterChange(sharp, sigma, sigma_std), abs(sigma - sharp), wider),
+    )
 
 
 def _blur_p_value(name: str, deviations: float) -> float:
@@ -437,16 +465,10 @@ def _blur_p_value(name: str, deviations: float) -> float:
     return (2 if name == "exposure_time" else 1) * student_tail(deviations, local_blur.BLOCKS - 1)
 
 
-def _exposure_holds(fitted: local_blur_fit.BlurFit, hypothesis: float | None) -> bool:
-    """Whether the blur requires another exposure, and one that agrees with the points' time offset."""
-    if hypothesis is None or not fitted.determined[0] or not 0.3 < hypothesis < 3.0:
+def _exposure_holds(fitted: local_blur_fit.BlurFit, given: float, hypothesis: float | None) -> bool:
+    """Whether the blur requires another exposure scale than the given, and one that agrees with the time offset."""
+    if hypothesis is None or not fitted.determined[0] or not 0.3 < hypothesis / given < 3.0:
         return False
-    scale, std = float(fitted.values[0][0]), max(float(fitted.std[0]), 0.03)
-    agrees = abs(scale - hypothesis) < 2.5 * std
-    return agrees and abs(scale - 1) > 1.5 * std and abs(scale - 1) > 2 * abs(scale - hypothesis)
-
-
-def _blur_change(k: int, nominal: CameraProfile, scale: float, sigma: float, std: Array) -> dict[str, ParameterChange]:
-    if k == 0:
-        return {"exposure_scale": ParameterChange(nominal.shutter.exposure_scale, scale, float(std[0]))}
-    return {"sigma_px": ParameterChange(nominal.extensions.defocus_sigma_px, sigma, float(std[1]))}
+    longer, std = float(fitted.values[0][0]) / given, max(float(fitted.std[0]) / given, 0.03)
+    off = abs(longer - hypothesis / given)
+    return off < 2.5 * std and abs(longer - 1) > 1.5 * std and abs(longer - 1) > 2 * off

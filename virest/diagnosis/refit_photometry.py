@@ -64,7 +64,8 @@ def settle_light(
         uncertainty = _curve_by_mixing(curve, prior)
     uncertainty.spread[2, 2] = _exposure_variance(causes)
     widened = replace(fitted, covariance=fitted.covariance + _added_covariance(observations, fitted, uncertainty))
-    findings = [_refreshed(finding, fitted, widened, observations) for finding in light.findings]
+    nominal = light.nominal or given
+    findings = [_refreshed(finding, fitted, widened, observations, nominal) for finding in light.findings]
     notes = [*light.notes, *_notes(light, curve)]
     found = replace(light, profile=fitted.profile, findings=findings, fitted=fitted, notes=notes)
     return found, fitted.profile
@@ -78,14 +79,18 @@ def _same_photometry(observations: PhotometricObservations, one: CameraProfile, 
 
 
 def _refreshed(
-    finding: Finding, fitted: PhotometricFit, widened: PhotometricFit, observations: PhotometricObservations
+    finding: Finding,
+    fitted: PhotometricFit,
+    widened: PhotometricFit,
+    observations: PhotometricObservations,
+    nominal: CameraProfile,
 ) -> Finding:
     """A finding with its refitted values; whether the effect exists does not depend on the curve's uncertainty."""
     effect = next(e for e in fitted.effects if e.name == finding.name)
-    nominal = {name: change.nominal for name, change in finding.parameters.items()}
+    before = {name: change.nominal for name, change in finding.parameters.items()}
     std = np.sqrt(np.diag(widened.of(effect.name)[1]))
-    changes = changes_of(nominal, values_of(effect, fitted.profile), std, frames_of(fitted))
-    p_value = significance(fitted, effect.name, observations)[1]
+    changes = changes_of(before, values_of(effect, fitted.profile), std, frames_of(fitted))
+    p_value = significance(fitted, effect.name, observations, nominal)[1]
     return replace(finding, parameters=changes, p_value=p_value, sentence=sentence_of(effect.name, changes))
 
 

@@ -127,7 +127,7 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
     covariates = {
         name: values
         for name, values in observations.covariates(photometric.profile).items()
-        if name in ("row", "radius", "brightness", "row_fraction", "x_px", "y_px")
+        if name in ("row", "radius", "brightness")
     }
     weight = cauchy_weight(left**2, HALF_WEIGHT_SIGMA * max(robust_std(left), 1.0))
     found = structures(left[:, None], weight, covariates, observations.frame.astype(np.intp), 0.5)

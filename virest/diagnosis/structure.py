@@ -33,7 +33,7 @@ class Structure:
 def structures(
     values: Array, weight: Array, covariates: dict[str, Array], block: NDArray[np.intp], floor: float
 ) -> list[Structure]:
-    """Test each covariate (n,); strongest structure first.
+    """Test each covariate (n,), none of them time, which the blocks divide; strongest structure first.
 
     values: (n, k) residuals; weight: (n,); block: (n,) number of the time block.  floor: means this small, in the
     residuals' unit, are bias of the tracker or the codec.
@@ -47,12 +47,11 @@ def _along(
 ) -> Structure:
     edges = np.unique(np.quantile(covariate, np.linspace(0, 1, BINS + 1)[1:-1]))
     number = np.searchsorted(edges, covariate, side="right")
-    by_time = name == "time"
     excess, chi2, freedom, bins = 0.0, 0.0, 0, 0
     for b in range(len(edges) + 1):
         inside = number == b
         for column in values.T:
-            mean, error, count = _mean_of_blocks(column[inside], weight[inside], block[inside], by_time)
+            mean, error, count = _mean_of_blocks(column[inside], weight[inside], block[inside])
             if count < 2:
                 continue
             spread = error**2 + floor**2
@@ -65,21 +64,14 @@ def _along(
     return Structure(name, float(np.sqrt(excess / bins)), chi2_tail(chi2, freedom))
 
 
-def _mean_of_blocks(values: Array, weight: Array, block: NDArray[np.intp], by_time: bool) -> tuple[float, float, int]:
-    """(weighted mean, its standard error from the scatter between blocks, number of blocks).
-
-    by_time: the scatter is that of the values, whose number is returned.
-    """
+def _mean_of_blocks(values: Array, weight: Array, block: NDArray[np.intp]) -> tuple[float, float, int]:
+    """(weighted mean, its standard error from the scatter between blocks, number of blocks)."""
     if not len(values):
         return 0.0, 0.0, 0
     count = np.bincount(block)
     total = np.bincount(block, weight)
     usable = (count >= LEAST_IN_CELL) & (total > 0)
     means = np.bincount(block, weight * values)[usable] / total[usable]
-    if by_time:
-        scatter = values - np.average(values, weights=weight)
-        error = np.sqrt(np.sum((weight * scatter) ** 2)) / weight.sum()
-        return float(np.average(values, weights=weight)), float(2 * error), len(values)
     if len(means) < 2:
         return 0.0, 0.0, len(means)
     share = total[usable] / total[usable].sum()

@@ -73,6 +73,16 @@ def _extension(name: str) -> Read:
     return lambda profile: getattr(profile.extensions, name)
 
 
+def _estimated(name: str) -> Read:
+    """A value that only the estimates record; 0 without one."""
+
+    def read(profile: CameraProfile) -> float:
+        known = profile.estimates.get(name)
+        return known.value if known is not None and isinstance(known.value, float) else 0.0
+
+    return read
+
+
 def _applied(size: str, text: str) -> Callable[[CameraProfile], str]:
     """A line for the log where the extension ``size`` is on; {} is filled with the extensions."""
     return lambda profile: text.format(e=profile.extensions) if getattr(profile.extensions, size) else ""
@@ -419,7 +429,7 @@ _LIGHT = (
     Effect(
         "sharpening",
         EDGES,
-        (*_value("amount", lambda p: 0.0, _none), *_value("radius_px", lambda p: 0.0, _none)),
+        (*_value("amount", _estimated("amount"), _none), *_value("radius_px", _estimated("radius_px"), _none)),
         "",
         "the phone sharpened its frames",
         "the phone sharpened its frames with an unsharp mask (amount {amount}, radius {radius_px} px)",

@@ -136,7 +136,7 @@ def _bridged(
 ) -> Model:
     """The model with rates in the intervals, fitted to the points of a table."""
     form = bridging_form(stretches, capture.stamp_0_ns, rate_walk(capture.imu))
-    fitted = fit_model(evidence.imu, replace(model, scene=model.scene), (form.term,), table)
+    fitted = fit_model(evidence.imu, model, (form.term,), table)
     return replace(model, profile=fitted.profile)
 
 

@@ -7,7 +7,7 @@ informative.  Where all patches move alike, a linear slope is indistinguishable 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from virest.diagnosis.field.screening import MAX_P, MIN_T, RIVAL_GAIN_FRACTION, 
 from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
 from virest.inference.chance import t_ratio
+from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -32,8 +33,9 @@ FRAMES_IN_BLOCK, LEAST_BLOCKS = 3, 8
 MOST_OBSERVATIONS = 15_000
 MIN_SIZE = 0.06
 """Grey levels (rms).  On 19 captures without such a field, texture and encoder left up to 0.06, with t up to 1.8."""
-CAUCHY, CAP = 2.5, 5.0
-"""Residual with half weight, and residual cap, in noise σ."""
+CAP = 5.0
+"""Residual cap, in noise σ."""
+LEAST_SCALE = 1e-9
 RIDGE = 1e-3
 CURVE_STEP = 0.02
 MOST_CYCLES = 0.5
@@ -92,8 +94,7 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile, g
     zero, basis = _form(profile)
     design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
     left = at.residual / seen.noise
-    scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
-    weight = 1 / (1 + (left / (CAUCHY * scale)) ** 2) / scale**2
+    weight = _weight(left)
     tangent = _tangent(seen, profile, at, gains) / seen.noise[:, None]
     designs = [Design("gain", design[order, None], over_time=False)]
     (scored, *_) = score_forms(left[order, None], weight[order], tangent[order, None], designs, block[order]) or (None,)
@@ -130,12 +131,16 @@ def _fitted(
 
 
 def instead_of_cause(
-    observations: PhotometricObservations, profile: CameraProfile
+    observations: PhotometricObservations, profile: CameraProfile, causes: Collection[str]
 ) -> tuple[str, Callable[[CameraProfile], CameraProfile], LightField | None]:
-    """The cause that a map may replace, the profile without it, and the map; None for the map if none replaces it."""
-    if (found := instead_of_gain(observations, profile)) is not None:
+    """The cause that a map may replace, the profile without it, and the map; None for the map if none replaces it.
+
+    causes: names of the causes found; a gain or a flicker that the profile already had is kept.
+    """
+    if "gain_drift" in causes and (found := instead_of_gain(observations, profile)) is not None:
         return "gain_drift", without_gain, found
-    return "flicker", without_flicker, instead_of_flicker(observations, profile)
+    instead = instead_of_flicker(observations, profile) if "flicker" in causes else None
+    return "flicker", without_flicker, instead
 
 
 def instead_of_flicker(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
@@ -195,13 +200,18 @@ def _left_by(seen: PhotometricObservations, profile: CameraProfile) -> float:
     """Capped residual rms of the patches under a profile, nuisances removed, grey levels."""
     at = predict(seen, profile)
     left, tangent = at.residual / seen.noise, _tangent(seen, profile, at) / seen.noise[:, None]
-    scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
-    weight = 1 / (1 + (left / (CAUCHY * scale)) ** 2) / scale**2
+    weight = _weight(left)
     block = np.unique(seen.frame // FRAMES_IN_BLOCK, return_inverse=True)[1]
     for fold in (0, 1):
         judged = block % 2 == fold
         left[judged] = _without(tangent[judged], left[judged], weight[judged], block[judged])
     return float(np.sqrt(np.mean(seen.noise**2))) * _capped_rms(left)
+
+
+def _weight(left: Array) -> Array:
+    """Robust weights (n,) of residuals over their squared scale."""
+    scale = max(robust_std(left), LEAST_SCALE)
+    return cauchy_weight(left**2, CAUCHY * scale) / scale**2
 
 
 def with_light_field(profile: CameraProfile, found: LightField) -> CameraProfile:

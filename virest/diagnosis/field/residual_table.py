@@ -18,6 +18,7 @@ from virest.camera.field import Field, cardinal_weights
 from virest.diagnosis.field.screening import MAX_P, Design, score_forms, select
 from virest.diagnosis.field.words import PATTERNS, SAMPLES, curve_shape, lens_words, shape_of, shape_of_pair
 from virest.errors import CaptureError
+from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -33,8 +34,7 @@ MAX_PX = 1e6
 """No frame is this large; larger values are an error of units."""
 MIN_SIZE_PX = 0.01
 """Smaller structure does not affect a calibration."""
-CAUCHY = 2.4
-MAD = 0.6745
+LEAST_SCALE_PX = 1e-9
 SHIFT = "points are shifted by up to {size} {shape} of {name}, the same everywhere in the frame"
 QUANTITY = "residual_rms_px"
 
@@ -120,7 +120,7 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
     current = left
     for _ in range(MAX_FINDINGS):
         scale = _scale(current)
-        weight = 1 / (1 + (current**2).sum(axis=-1) / (CAUCHY * scale) ** 2)
+        weight = cauchy_weight((current**2).sum(axis=-1), CAUCHY * scale)
         taken = {known[0].name for known in found}
         for group, beside in ((forms, []), (pairs, [form.design for form in forms])):
             open_forms = [form for form in group if form.name not in taken]
@@ -138,7 +138,7 @@ def criticise(columns: Mapping[str, Array]) -> Criticism:
         found.append((form, selection.best.p_value, selection.rivals, scale, after))
         current = left - tangent @ _solved(tangent, left, weight)
     left_px = _scale(current)
-    weight = 1 / (1 + (current**2).sum(axis=-1) / (CAUCHY * left_px) ** 2)
+    weight = cauchy_weight((current**2).sum(axis=-1), CAUCHY * left_px)
     numbers, covariance = _fitted(tangent, left, weight, block)
     findings, start = [], 2
     for form, p_value, rivals, before, after in found:
@@ -263,7 +263,7 @@ def _over_picture(x: Array, y: Array) -> _Form:
 
 def _scale(left: Array) -> float:
     """Robust standard deviation per coordinate."""
-    return max(float(np.median(np.abs(left - np.median(left, axis=0)))) / MAD, 1e-9)
+    return max(robust_std(left - np.median(left, axis=0)), LEAST_SCALE_PX)
 
 
 def _solved(design: Array, left: Array, weight: Array) -> Array:

@@ -17,6 +17,7 @@ from virest.diagnosis.field.design import PointResiduals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, step_forms
 from virest.diagnosis.field.forms import FieldForm
 from virest.image_formation.point_model import seen_s
+from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
 Array = NDArray[np.float64]
 FALSE_ALARM_RATE = 1e-4
@@ -25,8 +26,7 @@ LEAST_POINTS, LEAST_PAIRS = 8, 15
 INSTANTS, REACH = 97, FRAMES_PER_STEP + 1.0
 """Number of instants tried, and the search range in frames before and after: the coarse search ignores FRAMES_PER_STEP
 frames around a change, and its instants are off by up to half of that."""
-CAUCHY = 2.5
-"""In standard deviations."""
+LEAST_SCALE = 1e-9
 _ITERATIONS = 8
 
 
@@ -53,7 +53,7 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
         return None
     growth = np.array([_growth(arm[table.pair == k], off[table.pair == k]) for k in pairs])
     middle = float(np.median(growth))
-    spread = 1.4826 * float(np.median(np.abs(growth - middle)))
+    spread = robust_std(growth - middle)
     most = int(np.argmax(np.abs(growth - middle)))
     ratio = abs(growth[most] - middle) / max(spread, 1e-12)
     p_value = min(2 * len(pairs) * float(stats.t.sf(ratio, len(pairs) - 1)), 1.0)
@@ -77,8 +77,7 @@ def _growth(arm: Array, off: Array) -> float:
         root = np.sqrt(weight)
         found = np.linalg.lstsq(design * root[:, None], flat * root, rcond=None)[0]
         left = flat - design @ found
-        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-9)
-        weight = 1 / (1 + (left / (CAUCHY * scale)) ** 2)
+        weight = cauchy_weight(left**2, CAUCHY * max(robust_std(left), LEAST_SCALE))
     return float(found[0])
 
 

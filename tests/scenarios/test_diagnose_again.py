@@ -1,0 +1,79 @@
+"""Diagnose again with the extended profile, or with the true one: nothing more is found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from virest.app.diagnose import extended_text, open_source
+from virest.app.simulate import simulate_command
+from virest.camera.profile_file import read_profile
+from virest.diagnosis.findings import CONSISTENT, EXPLAINED, Diagnosis
+from virest.diagnosis.ladder import diagnose_capture
+
+pytestmark = pytest.mark.scenario
+
+
+def _capture(folder: Path, effects: list[str], seed: int, **options: Any) -> Path:
+    simulate_command(
+        folder, width=320, height=240, seed=seed, effects=effects, rate_rad_s=1.1, truth_frames=False, overwrite=True,
+        **{"frames": 21, "exposure_ms": 8, **options},
+    )  # fmt: skip
+    return folder
+
+
+def _diagnosed(folder: Path, config: Path | None = None) -> Diagnosis:
+    source = open_source(folder, config)
+    return diagnose_capture(source.capture, source.profile, source.pictures, source.gray)
+
+
+@pytest.mark.parametrize(
+    ("effect", "seed", "options"),
+    [("scene_depth=1.5", 516, {"sway_m": 0.12}), ("frame_lag=0.1,9", 526, {})],
+)
+def test_the_extended_profile_explains_the_capture(work: Path, effect: str, seed: int, options: dict[str, Any]) -> None:
+    """The cause is in the profile's file, and a second diagnosis takes it over."""
+    name, _, value = effect.partition("=")
+    folder = _capture(work / f"again_{name}", [effect], seed, **options)
+    found = _diagnosed(folder)
+    assert [cause.name for cause in found.causes] == [name]
+    assert found.verdict == EXPLAINED
+    extended = work / f"{name}.yaml"
+    extended.write_text(extended_text(name, found), encoding="utf-8")
+    profile = open_source(folder, extended).profile
+    kept = profile.depth_m if name == "scene_depth" else profile.extensions.frame_lag_s
+    assert kept == pytest.approx(float(value.split(",")[0]), rel=0.02)
+    again = _diagnosed(folder, extended)
+    assert again.verdict == CONSISTENT
+    assert not again.causes
+    assert not again.fields
+
+
+def test_the_true_profile_has_no_cause(work: Path) -> None:
+    """Its exposure scale, defocus and gains are counted as its own, not as changes."""
+    effects = ["exposure_time=0.7", "defocus=1.8", "gain_drift=0.05"]
+    folder = _capture(work / "true_profile", effects, 522, exposure_ms=14)
+    found = _diagnosed(folder, folder / "truth" / "camera.yaml")
+    assert found.verdict == CONSISTENT
+    assert not found.causes
+
+
+def test_an_unknown_readout_is_written_as_it_was_fitted(work: Path) -> None:
+    """It is no cause, and the extended profile states it; left unknown, the offset fitted beside it would not hold."""
+    source = open_source(_capture(work / "unknown_readout", [], 518))
+    shutter = replace(source.profile.shutter, readout_time_s=0.0)
+    given = replace(source.profile, shutter=shutter, readout_known=False, time_offset_s=None)
+    found = diagnose_capture(source.capture, given, source.pictures, source.gray)
+    assert found.verdict == CONSISTENT
+    extended = work / "readout.yaml"
+    extended.write_text(extended_text("readout", found), encoding="utf-8")
+    profile = read_profile(extended)
+    assert profile.readout_known
+    for name, value, truth in (
+        ("readout_time_s", profile.shutter.readout_time_s, 0.02),
+        ("time_offset_s", profile.time_offset_s, 0.0),
+    ):
+        assert abs(value - truth) < 4 * profile.estimates[name].std
