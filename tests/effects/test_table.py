@@ -162,7 +162,7 @@ def test_the_simulator_has_a_line_for_every_effect_and_no_other() -> None:
     assert simulated._BY_NAME.keys() == EFFECTS.keys()
     context = simulated.EffectContext(20, 30.0, np.random.default_rng(1))
     for name, effect in simulated.EFFECTS.items():
-        assert effect.spread or len(effect.draw(whole_profile(), context)) == len(effect.parameters), name
+        assert effect.per_frame or len(effect.draw(whole_profile(), context)) == len(effect.parameters), name
 
 
 def test_every_sentence_can_be_filled_and_every_unit_is_known() -> None:
