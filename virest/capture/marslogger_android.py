@@ -215,7 +215,7 @@ def _check_gyro_header(columns: tuple[str, ...], path: Path) -> None:
     if columns[0] != "timestamp[nanosec]" or columns[1:7] != expected:
         raise ImuError(
             f"{name}: columns are {', '.join(columns)[:120]}",
-            hint=f"expected Timestamp[nanosec], {', '.join(expected)}",
+            hint=f"expected Timestamp[nanosec], {', '.join(expected)}; without an accelerometer, write null for it",
         )
 
 
