@@ -29,7 +29,8 @@ demo: $(INSTALLED)
 	@echo "Open this in a browser: $(CURDIR)/demo-out/report.html"
 
 test: $(READY)
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadgroup --no-loadscope-reorder
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadgroup --no-loadscope-reorder \
+		--max-worker-restart 0
 
 bench: $(READY)
 	$(BIN)/python -m virest.app.bench $(ARGS)
