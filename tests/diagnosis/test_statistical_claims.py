@@ -14,7 +14,7 @@ from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_findings import findings_of
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.residual_tests import _more_than_noise
-from virest.image_formation.point_model import ground
+from virest.image_formation.point_model import integrate_motion
 from virest.inference.chance import chance_of
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
 from virest.inference.track_fit import many_directions, start_scene
@@ -81,7 +81,7 @@ def test_noise_stands_beside_the_residual_that_it_is_part_of(inertial: bool) -> 
     evidence = make_evidence(camera.imu, camera.observed)
     model = Model(camera.profile, None, ())
     table = evidence.table(model, 3000)
-    known = ground(camera.imu, camera.profile, translation=True)
+    known = integrate_motion(camera.imu, camera.profile, translation=True)
     scene = start_scene(camera.imu, known, table, 0.5) if inertial else many_directions(table)
     fitted = evidence.fit(replace(model, scene=scene), (), table)
     noise, residual = tracking_noise_px(camera.observed, fitted), residual_px(fitted)

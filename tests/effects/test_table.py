@@ -18,7 +18,7 @@ from virest.camera.response import ResponseCurve
 from virest.effects.records import GEOMETRY
 from virest.effects.table import EFFECTS
 from virest.effects.touches import touched
-from virest.image_formation.point_model import IntegratedMotion, ground, predict, with_profile
+from virest.image_formation.point_model import IntegratedMotion, integrate_motion, predict, with_profile
 from virest.report.words import UNITS
 from virest.simulation import effects as simulated
 
@@ -127,8 +127,8 @@ def test_a_changed_value_changes_predictions_as_a_fresh_integration_does(name: s
     """What is kept of an earlier profile's integration is never stale."""
     imu, before, after = recorded(SWAYING).imu, whole_profile(), changed_profiles()[name]
     for travels in (True, False):
-        known = ground(imu, before, translation=travels)
-        fresh = seen_px(ground(imu, after, translation=travels), travels)
+        known = integrate_motion(imu, before, translation=travels)
+        fresh = seen_px(integrate_motion(imu, after, translation=travels), travels)
         np.testing.assert_allclose(seen_px(with_profile(known, imu, after), travels), fresh, atol=1e-9)
 
 

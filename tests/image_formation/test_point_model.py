@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
-from virest.image_formation.point_model import ground, predict, pulse_delay_s, seen_s, with_profile
+from virest.image_formation.point_model import integrate_motion, predict, pulse_delay_s, seen_s, with_profile
 from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import Term
@@ -51,7 +51,7 @@ WINDOWS = [list(range(13)), list(range(13, 29))]
 def test_points_far_away_are_predicted_to_a_hundredth_of_a_pixel(setup: Setup) -> None:
     """Turning only: motion of 13 px a frame, rows, exposures, clock and lens all as the generator makes them."""
     recording, table = recorded(setup), recorded(setup).table()
-    found = predict(ground(recording.imu, recording.profile, translation=False), table, None)
+    found = predict(integrate_motion(recording.imu, recording.profile, translation=False), table, None)
     assert np.median(np.linalg.norm(table.second_px - table.first_px, axis=1)) > 5
     assert np.abs(found.second_px - table.second_px).max() < 0.01
     np.testing.assert_allclose(found.first_s, recording.seen_s(table.first_px, table.first), atol=1e-9)
@@ -65,7 +65,7 @@ def test_points_on_a_wall_are_predicted_to_a_hundredth_of_a_pixel(
 ) -> None:
     """Turning and swaying before a wall, with the true velocity, gravity, bias, delay and plane of each window."""
     recording, table = recorded(setup), recorded(setup).table(windows)
-    known = ground(recording.imu, recording.profile, translation=True)
+    known = integrate_motion(recording.imu, recording.profile, translation=True)
     found = predict(known, table, recording.scene(table))
     assert np.abs(found.second_px - table.second_px).max() < 0.012
     turning = predict(known, table, None)
@@ -76,7 +76,7 @@ def test_points_on_a_wall_are_predicted_to_a_hundredth_of_a_pixel(
 def test_slopes_of_the_motion_are_difference_quotients(setup: Setup) -> None:
     """Each entry of the motion's vector, the planes' to 0.2 %; the others leave out how the path changes depths."""
     recording, table = recorded(setup), recorded(setup).table(WINDOWS)
-    known, scene = ground(recording.imu, recording.profile, translation=True), recording.scene(table)
+    known, scene = integrate_motion(recording.imu, recording.profile, translation=True), recording.scene(table)
     slopes = predict(known, table, scene, slopes=True).slopes
     assert slopes is not None
     assert slopes.shape == (len(table), 2, 7 + 6 * 2)
@@ -93,7 +93,7 @@ def test_parallax_of_a_direction_lies_along_what_travel_does() -> None:
     """Points at any depth leave the turning's prediction along the flow of the camera's true direction."""
     setup = Setup(seed=9, noise_px=0.0, velocity_m_s=(0.4, -0.3, 1.5), inverse_depth_per_m=(0.02, 0.2), about=(0, 0, 0))
     recording, table = recorded(setup), recorded(setup).table()
-    known = ground(recording.imu, recording.profile, translation=False)
+    known = integrate_motion(recording.imu, recording.profile, translation=False)
     way = recording.in_trajectory_axes(np.array(setup.velocity_m_s))
     along = predict(known, table, DirectedMotion(way[None] / np.linalg.norm(way)), slopes=True).along_px
     assert along is not None
@@ -110,7 +110,7 @@ def test_parallax_of_a_direction_lies_along_what_travel_does() -> None:
 def test_the_way_of_parallax_is_the_same_with_slopes_and_without(setup: Setup) -> None:
     """By a difference quotient or by the lens's slope: pixels per inverse depth along what the camera travels."""
     recording, table = recorded(setup), recorded(setup).table()
-    known, scene = ground(recording.imu, recording.profile, translation=True), recording.scene(table)
+    known, scene = integrate_motion(recording.imu, recording.profile, translation=True), recording.scene(table)
     quick, exact = (predict(known, table, scene, slopes=slopes).along_px for slopes in (False, True))
     assert quick is not None
     assert exact is not None
@@ -220,12 +220,12 @@ def test_what_is_kept_from_profile_to_profile_changes_no_prediction(term: Term) 
     """A ground carried over to a changed profile predicts like one made afresh, with and without translation."""
     setup = replace(NEAR["long arm, skewed clock"], points=4)
     recording, table = recorded(setup), recorded(setup).table()
-    known = ground(recording.imu, recording.profile, translation=True)
+    known = integrate_motion(recording.imu, recording.profile, translation=True)
     changed = term.change(recording.profile, 3 * np.array(term.quotient))
     assert changed != recording.profile
     for scene in (None, recording.scene(table)):
         carried = predict(with_profile(known, recording.imu, changed), table, scene)
-        fresh = predict(ground(recording.imu, changed, translation=True), table, scene)
+        fresh = predict(integrate_motion(recording.imu, changed, translation=True), table, scene)
         np.testing.assert_allclose(carried.second_px, fresh.second_px, rtol=0, atol=1e-9)
         assert np.abs(carried.second_px - predict(known, table, scene).second_px).max() > 1e-4
 
@@ -237,7 +237,7 @@ def test_a_terms_steps_add_up_and_can_be_taken_back(term: Term) -> None:
     recording, table = recorded(setup), recorded(setup).table()
 
     def predicted(profile: CameraProfile) -> np.ndarray:
-        return predict(ground(recording.imu, profile, translation=False), table, None).second_px
+        return predict(integrate_motion(recording.imu, profile, translation=False), table, None).second_px
 
     for k, quotient in enumerate(term.quotient):
         step = quotient * np.eye(len(term))[k]

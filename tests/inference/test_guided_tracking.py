@@ -11,7 +11,7 @@ from motion.turning_pictures import R_CAM_IMU, Phone, Recording, blobs, chessboa
 from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
-from virest.image_formation.point_model import ground, predict
+from virest.image_formation.point_model import integrate_motion, predict
 from virest.inference.guidance import gyro_guide
 from virest.inference.guide_choice import find_guide
 from virest.inference.observed_tracks import track_table
@@ -42,7 +42,7 @@ def off_px(recording: Recording, pairs: list[TrackPair]) -> Array:
     stamp_s = np.array([frame.time_s for frame in recording.capture.frames])
     exposure_s = np.full(len(stamp_s), recording.phone.exposure_s)
     table = track_table(pairs, stamp_s, exposure_s, np.ones(len(pairs)))
-    put = predict(ground(recording.capture.imu, recording.phone.profile, translation=False), table, None)
+    put = predict(integrate_motion(recording.capture.imu, recording.phone.profile, translation=False), table, None)
     return np.asarray(np.linalg.norm(table.second_px - put.second_px, axis=1))
 
 
@@ -185,7 +185,7 @@ def put_by(recording: Recording, profile: CameraProfile, pair: TrackPair) -> Arr
     """Where a profile puts a pair's points (n, 2) in the second frame."""
     stamp_s = np.array([frame.time_s for frame in recording.capture.frames])
     table = track_table([pair], stamp_s, np.full(len(stamp_s), recording.phone.exposure_s), np.ones(1))
-    return predict(ground(recording.capture.imu, profile, translation=False), table, None).second_px
+    return predict(integrate_motion(recording.capture.imu, profile, translation=False), table, None).second_px
 
 
 def test_what_goes_its_own_way_is_still_followed(wall: Recording) -> None:

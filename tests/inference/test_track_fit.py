@@ -11,7 +11,7 @@ from motion.synthetic_tracks import Recording, Setup, recorded
 
 from virest.camera.profile import CameraProfile
 from virest.errors import ImuError
-from virest.image_formation.point_model import ground, predict
+from virest.image_formation.point_model import integrate_motion, predict
 from virest.inference import profile_terms as terms_of
 from virest.inference.clustered import CovarianceModel
 from virest.inference.coded_motion import StepSlopes, drawn_px, step_slopes
@@ -73,7 +73,7 @@ def fitted_from(recording: Recording, terms: Sequence[Term]) -> TrackFit:
 def fitted_wall(recording: Recording, terms: Sequence[Term], windows: list[list[int]] | None = None) -> TrackFit:
     """Fit with the accelerometer's path, from a spoilt profile and a scene that knows nothing."""
     profile, table = spoilt(recording.profile, terms), recording.table(windows)
-    scene = start_scene(recording.imu, ground(recording.imu, profile, translation=True), table, 0.7)
+    scene = start_scene(recording.imu, integrate_motion(recording.imu, profile, translation=True), table, 0.7)
     return fit_tracks(recording.imu, table, profile, terms, scene)
 
 
@@ -243,7 +243,7 @@ def test_relief_that_stands_in_its_place_is_one_error_and_not_many() -> None:
     recording = recorded(replace(WALL, sway_m=0.02, velocity_m_s=(0.05, -0.1, 1.0), points=200))
     table = recording.table()
     scene = recording.scene(table)
-    known = ground(recording.imu, recording.profile, translation=True)
+    known = integrate_motion(recording.imu, recording.profile, translation=True)
     along = predict(known, table, scene).along_px
     assert along is not None
     parts = (table.first_px // 120).astype(int)
@@ -275,7 +275,7 @@ def test_the_scene_begins_with_gravity_down() -> None:
     """At rest, before a plane across the view, with gravity of 9.81 m/s² within ten degrees of the truth."""
     recording = recorded(WALL)
     table = recording.table()
-    scene = start_scene(recording.imu, ground(recording.imu, recording.profile, translation=True), table, 0.4)
+    scene = start_scene(recording.imu, integrate_motion(recording.imu, recording.profile, translation=True), table, 0.4)
     truth = recording.scene(table)
     assert np.linalg.norm(scene.gravity_m_s2) == pytest.approx(9.81)
     assert scene.gravity_m_s2 @ truth.gravity_m_s2 / 9.81**2 > np.cos(np.radians(10))
@@ -314,7 +314,7 @@ def test_steps_of_the_rows_above_are_within_the_deviation(term: Term, read: str)
     """
     recording = recorded(replace(LANDSCAPE, readout_direction=read, gyro_noise_rad_s=0.0, noise_px=0.15, frames=60))
     table, profile = recording.table(), recording.profile
-    known = ground(recording.imu, profile, translation=False)
+    known = integrate_motion(recording.imu, profile, translation=False)
     slopes = step_slopes(known, table, None, predict(known, table, None))
     drawn = drawn_px(slopes, table.noise_px[table.pair])[3]
     fits = [
@@ -333,12 +333,14 @@ def test_what_a_still_camera_centre_explains_is_apart_from_the_rows_times() -> N
     """Slopes at one instant are those of a global shutter; rows' times add the rest, along the readout alone."""
     recording = recorded(replace(LANDSCAPE, gyro_noise_rad_s=0.0, clock_skew=0.0, frames=20))
     table, profile = recording.table(), recording.profile
-    known = ground(recording.imu, profile, translation=False)
+    known = integrate_motion(recording.imu, profile, translation=False)
     at = predict(known, table, None)
     slopes = step_slopes(known, table, None, at)
     assert not slopes.by_rows[0].any()
     moved = replace(profile.intrinsics, cx_px=profile.intrinsics.cx_px, cy_px=profile.intrinsics.cy_px - 1.0)
-    shifted = predict(ground(recording.imu, replace(profile, intrinsics=moved), translation=False), table, None)
+    shifted = predict(
+        integrate_motion(recording.imu, replace(profile, intrinsics=moved), translation=False), table, None
+    )
     np.testing.assert_allclose(shifted.second_px - at.second_px, slopes.at_once[1], atol=1e-7)
 
 

@@ -79,12 +79,12 @@ def test_gravity_less_the_bias_is_what_rests_on_the_accelerometer() -> None:
     camera, found = recorded(SWAYS["portrait"]), aligned(SWAYS["portrait"])
     stretch = found.stretches[0]
     (gravity, gravity_std), (bias, bias_std) = stretch.gravity(), stretch.accel_bias()
-    start = stretch.fit.ground.trajectory.time_s[0]
+    start = stretch.fit.integrated.trajectory.time_s[0]
     true_gravity = camera.orientation(start).inv().apply(GRAVITY_M_S2)
     assert np.all(np.abs(gravity - true_gravity) < 4 * gravity_std + 0.05)
     assert np.all(np.abs(bias - camera.setup.accel_bias_m_s2) < 4 * bias_std)
     origin = stretch.origin_s(0)
-    to_imu = camera.profile.rotation_cam_imu.T @ stretch.fit.ground.trajectory.orientation(origin).T
+    to_imu = camera.profile.rotation_cam_imu.T @ stretch.fit.integrated.trajectory.orientation(origin).T
     true_rest = camera.profile.rotation_cam_imu.T @ camera.orientation(origin).inv().apply(-GRAVITY_M_S2)
     np.testing.assert_allclose(to_imu @ -gravity + bias, true_rest + camera.setup.accel_bias_m_s2, atol=0.04)
 

@@ -38,7 +38,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
 from virest.effects.changes import keep_readout
 from virest.errors import CalibrationError
-from virest.image_formation.point_model import TrackTable, ground
+from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.blur_bias import blur_bias_px
@@ -352,7 +352,7 @@ def _fit_with_translation(
     beside = [term for term in asked if term not in wanted]
     if beside and (lens := fit_tracks(imu, table, plain.profile, [*wanted, *beside])).scale < EXPLAINED_SCALE:
         return lens
-    known = ground(imu, start, translation=True)
+    known = integrate_motion(imu, start, translation=True)
     if known.displacement is not None:
         scene = start_scene(imu, known, table, START_INVERSE_DEPTH_PER_M)
         inertial = fit_tracks(imu, table, start, wanted, scene)
@@ -393,7 +393,7 @@ def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names
             break
     corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
     if corrected:  # without an accelerometer the blur due to translation is unknown
-        table = replace(table, second_px=table.second_px - blur_bias_px(fit.ground, table))
+        table = replace(table, second_px=table.second_px - blur_bias_px(fit.integrated, table))
         fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene)
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
 from virest.diagnosis.geometric_evidence import Evidence, Model, free_scene
-from virest.image_formation.point_model import TrackTable, ground, predict
+from virest.image_formation.point_model import TrackTable, integrate_motion, predict
 from virest.inference.recorder_lag import Schedule
 from virest.inference.track_fit import Term
 from virest.motion.scene_motion import InertialMotion
@@ -83,7 +83,7 @@ def worth_beginning(evidence: Evidence, model: Model, candidates: list[Candidate
 
 def _median_residual_px(evidence: Evidence, model: Model, table: TrackTable) -> float:
     """Median residual of the points under a model, px."""
-    known = ground(evidence.imu, model.profile, translation=isinstance(model.scene, InertialMotion))
+    known = integrate_motion(evidence.imu, model.profile, translation=isinstance(model.scene, InertialMotion))
     residual_px = table.second_px - predict(known, table, model.scene).second_px
     return float(np.median(np.linalg.norm(residual_px, axis=-1)))
 

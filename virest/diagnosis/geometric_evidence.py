@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from virest.calibration.physical_limits import impossible
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.image_formation.point_model import TrackTable, centre, ground, seen_s
+from virest.image_formation.point_model import TrackTable, centre, integrate_motion, seen_s
 from virest.inference.comparable_noise import noise_distances
 from virest.inference.hold_out import distances, loss
 from virest.inference.observed_tracks import ObservedTracks
@@ -147,7 +147,7 @@ def base_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) ->
     depth_m = profile.depth_m
     if depth_m is not None and np.isinf(depth_m):
         return None
-    known = ground(evidence.imu, profile, translation=True)
+    known = integrate_motion(evidence.imu, profile, translation=True)
     if known.displacement is None:
         return many_directions(table)
     scene = start_scene(evidence.imu, known, table, START_INVERSE_DEPTH_PER_M if depth_m is None else 1 / depth_m)
@@ -164,7 +164,7 @@ def base_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) ->
 
 def free_scene(evidence: Evidence, profile: CameraProfile, table: TrackTable) -> InertialMotion | None:
     """A plane at an unknown depth; None without an accelerometer."""
-    known = ground(evidence.imu, profile, translation=True)
+    known = integrate_motion(evidence.imu, profile, translation=True)
     if known.displacement is None:
         return None
     return start_scene(evidence.imu, known, table, START_INVERSE_DEPTH_PER_M)
@@ -174,15 +174,15 @@ def depth_of(fitted: TrackFit, table: TrackTable) -> tuple[float, float]:
     """Median over the frames of the distance along the optical axis at the frame centre, and its standard deviation."""
     scene = fitted.scene
     assert isinstance(scene, InertialMotion)
-    assert fitted.ground.displacement is not None
+    assert fitted.integrated.displacement is not None
     frames, rows = np.unique(table.first, return_index=True)
     profile, window = fitted.profile, table.window[rows]
     middle = np.tile([0.5 * (profile.width - 1), 0.5 * (profile.height - 1)], (len(frames), 1))
     time_s = seen_s(profile, middle, table.first_stamp_s[rows], table.first_exposure_s[rows])
     origin_s = np.asarray(profile.imu_time_s(table.origin_s))[window]
-    where = centre(fitted.ground.displacement, scene, scene.velocity_m_s[window], time_s, origin_s)[0]
+    where = centre(fitted.integrated.displacement, scene, scene.velocity_m_s[window], time_s, origin_s)[0]
     world = np.squeeze(
-        fitted.ground.trajectory.orientation(time_s) @ fitted.ground.lens.rays(middle, time_s)[..., None], -1
+        fitted.integrated.trajectory.orientation(time_s) @ fitted.integrated.lens.rays(middle, time_s)[..., None], -1
     )
     plane = scene.plane_per_m[window]
     inverse = (plane * world).sum(axis=-1) / np.maximum(1 - (plane * where).sum(axis=-1), 0.05)

@@ -353,7 +353,7 @@ def travel_blur_px(geometric: GeometricVerdict) -> float:
         return 0.0
     if not isinstance(fitted.scene, InertialMotion):
         return float("inf")
-    seen = (predict(fitted.ground, table, scene).second_px for scene in (fitted.scene, None))
+    seen = (predict(fitted.integrated, table, scene).second_px for scene in (fitted.scene, None))
     apart_s = np.maximum(table.second_stamp_s - table.first_stamp_s, 1e-6)
     exposure_s = np.asarray(fitted.profile.shutter.true_exposure_s(table.second_exposure_s))
     travelled_px = np.linalg.norm(np.subtract(*seen), axis=-1) * exposure_s / apart_s

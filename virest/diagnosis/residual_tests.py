@@ -65,7 +65,7 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
         "radius": radius,
         "x": table.second_px[:, 0],
         "y": table.second_px[:, 1],
-        "rate": np.linalg.norm(fitted.ground.trajectory.rate_rad_s(second_s), axis=-1),
+        "rate": np.linalg.norm(fitted.integrated.trajectory.rate_rad_s(second_s), axis=-1),
     }
     found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
     found.append(_along_time(left_px, fitted.weight, table.pair))
@@ -146,7 +146,7 @@ def residuals(geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:
     assert lens is not None
     centre = np.array([lens.cx_px, lens.cy_px])
     second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
-    rate = np.linalg.norm(fitted.ground.trajectory.rate_rad_s(second_s), axis=-1)
+    rate = np.linalg.norm(fitted.integrated.trajectory.rate_rad_s(second_s), axis=-1)
     return {
         "x_px": fitted.difference_px[:, 0],
         "y_px": fitted.difference_px[:, 1],

@@ -176,7 +176,7 @@ class Prediction:
         return self.poses.second_s
 
 
-def ground(
+def integrate_motion(
     imu: ImuSamples, profile: CameraProfile, *, translation: bool, measured: Measured | None = None
 ) -> IntegratedMotion:
     """Integrate the inertial samples with a profile's bias, scale and rotation; measured: of an earlier call."""
@@ -190,7 +190,7 @@ def with_profile(known: IntegratedMotion, imu: ImuSamples, profile: CameraProfil
     """The integrated motion for another profile, reusing everything that the change does not affect."""
     change = touched(known.profile, profile)
     if change.rates:
-        return ground(imu, profile, translation=known.displacement is not None, measured=known.measured)
+        return integrate_motion(imu, profile, translation=known.displacement is not None, measured=known.measured)
     like = None if change.axes else known.lens
     if change.axes:
         known = _turned_about(known, profile.rotation_cam_imu @ known.profile.rotation_cam_imu.T)

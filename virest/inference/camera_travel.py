@@ -103,7 +103,7 @@ class Stretch:
 
     def velocity(self, window: int, time_s: Array) -> Array:
         """Velocity (n, 3) of the camera's centre in world axes, IMU clock (n,)."""
-        return self._velocity(self.fit.ground, window, time_s)
+        return self._velocity(self.fit.integrated, window, time_s)
 
     def seen_velocity(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
         """Velocity (n, 3) in the camera's axes at stamps (n,), camera clock, and its covariance (n, 3, 3)."""
@@ -130,7 +130,7 @@ class Stretch:
         Slopes (n, 3, k) and (n, k) are per unit of every fitted value, the profile's terms included: rotating the IMU
         rotates gravity with it and leaves the velocity unchanged.
         """
-        velocity, nearness, rotation = self._seen_from(self.fit.ground, window, stamp_s)
+        velocity, nearness, rotation = self._seen_from(self.fit.integrated, window, stamp_s)
         slope = np.zeros((len(stamp_s), 3, len(self.fit.covariance)))
         nearness_slope = np.zeros((len(stamp_s), slope.shape[-1]))
         quotients = [step for term in self.fit.terms for step in term.quotient]
@@ -141,7 +141,7 @@ class Stretch:
         own = len(quotients) + 7 + 6 * window
         back = np.swapaxes(rotation, -1, -2)
         time_s = np.asarray(self.fit.profile.imu_time_s(stamp_s))
-        moves, origin = self.fit.ground.displacement, np.array([self.origin_s(window)])
+        moves, origin = self.fit.integrated.displacement, np.array([self.origin_s(window)])
         assert moves is not None
         slope[..., len(quotients) : len(quotients) + 7] = back @ _velocity_slope(moves, time_s, origin)
         slope[..., own : own + 3] = back
@@ -175,7 +175,7 @@ class Stretch:
 
     def place(self, window: int, time_s: Array) -> Array:
         """Camera centre (n, 3) relative to its position at the window's middle, world axes."""
-        moves = self.fit.ground.displacement
+        moves = self.fit.integrated.displacement
         assert moves is not None
         velocity = np.broadcast_to(self.scene.velocity_m_s[window], (len(time_s), 3))
         return centre(moves, self.scene, velocity, time_s, np.full(len(time_s), self.origin_s(window)))[0]
@@ -184,7 +184,7 @@ class Stretch:
         """The window's plane (3,) in camera axes at a time: the inverse depth of a ray r with z = 1 is plane · r."""
         plane = self.scene.plane_per_m[window]
         distance = max(1 - float(plane @ self.place(window, np.array([time_s]))[0]), 0.05)
-        return np.asarray(self.fit.ground.trajectory.orientation(time_s).T @ plane / distance)
+        return np.asarray(self.fit.integrated.trajectory.orientation(time_s).T @ plane / distance)
 
     def depth(self, window: int, time_s: float) -> FrameDepth:
         """The scene before the camera at a time, IMU clock: a plane, and a surface on it where the window has one."""
@@ -195,7 +195,7 @@ class Stretch:
         surface = relief.surface(self.view(window, time_s, found.plane_per_m))
         if surface is None:
             return found
-        lens = self.fit.ground.lens
+        lens = self.fit.integrated.lens
         middle = lens.rays(0.5 * np.array([lens.lens.width - 1.0, lens.lens.height - 1.0]), time_s)
         return found.with_relief(surface, middle, self.windows[window].scale_std)
 
@@ -205,9 +205,9 @@ class Stretch:
             self.points,
             window,
             time_s,
-            self.fit.ground.trajectory.orientation(time_s),
+            self.fit.integrated.trajectory.orientation(time_s),
             self.place(window, np.array([time_s]))[0],
-            self.fit.ground.lens,
+            self.fit.integrated.lens,
             self.plane(window, time_s),
             self.fit.depth_spread_per_m,
             self.windows[window].scale_std,
@@ -216,7 +216,7 @@ class Stretch:
     def view(self, window: int, time_s: float, plane_per_m: Array) -> View:
         """The camera's pose at a time, with the plane in front of it."""
         place = self.place(window, np.array([time_s]))[0]
-        return View(time_s, self.fit.ground.trajectory.orientation(time_s), place, plane_per_m)
+        return View(time_s, self.fit.integrated.trajectory.orientation(time_s), place, plane_per_m)
 
 
 def _velocity_slope(moves: Displacement, time_s: Array, origin_s: Array) -> Array:
@@ -291,7 +291,7 @@ class VisualInertialAlignment:
         if isinstance(found, str):
             return found
         stretch, window = found
-        known = stretch.fit.ground
+        known = stretch.fit.integrated
         time_s = np.asarray(known.profile.imu_time_s(np.array([reference_s, start_s, max(end_s, start_s + 1e-3)])))
         velocity = stretch.velocity(window, time_s)
         rotation = known.trajectory.orientation(time_s[0])

@@ -33,7 +33,7 @@ def noise_distances(observed: ObservedTracks, fitted: TrackFit) -> Array:
         residual = np.concatenate([smooth_flow_residual(pair) / noise for pair, noise in pairs])
         return np.asarray(np.linalg.norm(residual, axis=-1))
     table = observed.table(observed.tracks)
-    along_px = predict(fitted.ground, table, fitted.scene).along_px
+    along_px = predict(fitted.integrated, table, fitted.scene).along_px
     assert along_px is not None
     length = np.linalg.norm(along_px, axis=-1)
     way = along_px / np.maximum(length, 1e-12)[:, None]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
-from virest.image_formation.point_model import IntegratedMotion, ground, predict
+from virest.image_formation.point_model import IntegratedMotion, integrate_motion, predict
 from virest.image_formation.row_clock import RowClock
 from virest.inference.doubtful_log import doubtful_stretches
 from virest.inference.observed_tracks import frame_times, track_table
@@ -133,7 +133,7 @@ def gyro_guide(capture: Capture, profile: CameraProfile) -> GyroGuide:
     stamp_s, exposure_s, _ = frame_times(capture)
     stamp_s[[frame.skip_reason is not None for frame in capture.frames]] = np.nan
     stamp_s[_in_doubt(capture, profile, stamp_s, exposure_s)] = np.nan
-    return GyroGuide(ground(capture.imu, profile, translation=False), stamp_s, exposure_s)
+    return GyroGuide(integrate_motion(capture.imu, profile, translation=False), stamp_s, exposure_s)
 
 
 def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure_s: Array) -> NDArray[np.bool_]:

@@ -17,7 +17,7 @@ Index = NDArray[np.intp]
 def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
     """Whitened residual lengths (n,) of all points of a table for a fit that may have used only some of them."""
     scene = for_table(fitted.scene, table)
-    everywhere = fit_tracks(imu, table, fitted.profile, (), scene, max_iterations=0, known=fitted.ground)
+    everywhere = fit_tracks(imu, table, fitted.profile, (), scene, max_iterations=0, known=fitted.integrated)
     return everywhere.distance_at(depth_spread_per_m)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
-from virest.image_formation.point_model import IntegratedMotion, TrackTable, ground, with_profile
+from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, with_profile
 from virest.inference.clustered import CovarianceModel, Index, scatter
 from virest.inference.coded_motion import drawn_px, step_slopes
 from virest.inference.descent import MAX_ITERATIONS, descend, slices
@@ -83,7 +83,7 @@ class TrackFit:
     """(k,) effective number of time blocks that inform each value: (Σ share)² / Σ share² of its information."""
     cost: float
     """Σ of the robust loss over the whitened points: comparable between fits of one table."""
-    ground: IntegratedMotion
+    integrated: IntegratedMotion
     seconds: Array
     """(n,) times of the second points, IMU clock."""
     noise_px: Array
@@ -177,7 +177,7 @@ def fit_tracks(
     terms = tuple(terms)
     inertial = isinstance(scene, InertialMotion)
     if known is None or (inertial and known.displacement is None):
-        known = ground(imu, profile, translation=inertial)
+        known = integrate_motion(imu, profile, translation=inertial)
     known = with_profile(known, imu, profile)
     if inertial and known.displacement is None:
         raise ImuError("no accelerometer to determine the camera's path", hint="fit a free motion")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.image_formation.point_model import IntegratedMotion, TrackTable, ground, with_profile
+from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, with_profile
 from virest.inference.camera_travel import Stretch, VisualInertialAlignment, Window
 from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.depth import Sightings, triangulate, triangulate_relief
@@ -158,7 +158,7 @@ def _fit_stretch(
     imu = imu.between(first - IMU_MARGIN_S - settling_time_s(profile), last + IMU_MARGIN_S)
     terms = nuisance_terms(profile)
     rotating = fit_tracks(imu, table, profile, terms, max_iterations=ROTATION_ITERATIONS)
-    known = ground(imu, profile, translation=True)
+    known = integrate_motion(imu, profile, translation=True)
     if known.displacement is None:
         return None
     inverse_depth = START_INVERSE_DEPTH_PER_M if depth_m is None else 1 / depth_m
@@ -167,10 +167,10 @@ def _fit_stretch(
     if depth_m is not None:
         fit = _at_depth(fit, imu, table, profile, terms, depth_m)
     assert isinstance(fit.scene, InertialMotion)
-    points = triangulate(fit.ground, fit.scene, table)
+    points = triangulate(fit.integrated, fit.scene, table)
     stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table), _perturbed(fit, imu))
     stretch = replace(stretch, windows=tuple(_judged(stretch, rotating, k, depth_m) for k in range(table.n_windows)))
-    sights = triangulate_relief(fit.ground, fit.scene, observed.table(observed.tracks))
+    sights = triangulate_relief(fit.integrated, fit.scene, observed.table(observed.tracks))
     reliefs = tuple(_relief(stretch, sights, k) for k in range(table.n_windows))
     windows = tuple(_with_a_surface(window, relief) for window, relief in zip(stretch.windows, reliefs, strict=True))
     return replace(stretch, windows=windows, reliefs=reliefs)
@@ -180,7 +180,7 @@ def _relief(stretch: Stretch, sights: Sightings, window: int) -> WindowRelief | 
     """Relief on a window's planes, if it predicts held-out points better."""
     if not stretch.windows[window].usable:
         return None
-    grid = picture_grid(stretch.fit.ground.lens, stretch.origin_s(window))
+    grid = picture_grid(stretch.fit.integrated.lens, stretch.origin_s(window))
 
     def view(time_s: float) -> View:
         return stretch.view(window, time_s, stretch.frame_plane(window, time_s).plane_per_m)
@@ -191,7 +191,7 @@ def _relief(stretch: Stretch, sights: Sightings, window: int) -> WindowRelief | 
 def _perturbed(fit: TrackFit, imu: ImuSamples) -> tuple[IntegratedMotion, ...]:
     """The fit's integrated motion with each value of its terms changed by its difference step."""
     steps = [(term, np.diag(term.quotient)[k]) for term in fit.terms for k in range(len(term))]
-    return tuple(with_profile(fit.ground, imu, term.change(fit.profile, step)) for term, step in steps)
+    return tuple(with_profile(fit.integrated, imu, term.change(fit.profile, step)) for term, step in steps)
 
 
 def _velocity_floor(fit: TrackFit, table: TrackTable) -> Array:
@@ -210,7 +210,7 @@ def _at_depth(
     scene = fit.scene
     assert isinstance(scene, InertialMotion)
     origin = np.asarray(profile.imu_time_s(table.origin_s))
-    axis = fit.ground.trajectory.orientation(origin)[:, :, 2]
+    axis = fit.integrated.trajectory.orientation(origin)[:, :, 2]
     ratio = (1 / depth_m) / np.maximum((scene.plane_per_m * axis).sum(axis=-1), 0.02)[:, None]
     plane = scene.plane_per_m * ratio
     spread = STATED_DEPTH_STD * float(np.linalg.norm(plane, axis=-1).mean())
@@ -231,7 +231,7 @@ def _judged(stretch: Stretch, rotating: TrackFit, window: int, depth_m: float | 
     velocity, covariance = stretch.seen_velocity(window, times)
     spread = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean())
     speed = max(float(np.sqrt((velocity**2).sum(axis=-1).mean())), 1e-6)
-    axis = fit.ground.trajectory.orientation(stretch.origin_s(window))[:, 2]
+    axis = fit.integrated.trajectory.orientation(stretch.origin_s(window))[:, 2]
     inverse = max(float(stretch.scene.plane_per_m[window] @ axis), 1e-6)
     scale_std = stretch.plane_std_per_m(window) / inverse
     flow, flow_covariance = stretch.flow(window, times)

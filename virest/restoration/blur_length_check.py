@@ -54,7 +54,7 @@ MOST_CLIPPED = 0.002
 """Use tiles with a larger fraction of clipped light only if too few tiles have less."""
 RESAMPLED = 60
 """Number of bootstrap samples of the frames."""
-SURE = 3.0
+CERTAIN_SIGMA = 3.0
 """Above this many standard deviations the frames contradict a profile."""
 _FIT_STEPS = 6
 _TINY = 1e-30
@@ -83,7 +83,7 @@ class PathScale:
     @property
     def contradicts(self) -> bool:
         """Whether the frames contradict the predicted lengths significantly."""
-        return abs(np.log(self.scale)) > SURE * self.std and self.scale < LONGEST
+        return abs(np.log(self.scale)) > CERTAIN_SIGMA * self.std and self.scale < LONGEST
 
     def __str__(self) -> str:
         return f"{self.scale:.2f} ± {self.scale * self.std:.2f}"

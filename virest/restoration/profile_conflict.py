@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.image_formation.point_model import TrackTable, ground
+from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.hold_out import distances, group_means, loss
@@ -175,7 +175,7 @@ class _Search:
         return travelling if travelling.scale < TRANSLATION_GAIN * plain.scale else plain
 
     def _travel(self) -> Motion:
-        known = ground(self.imu, self.given, translation=True)
+        known = integrate_motion(self.imu, self.given, translation=True)
         if known.displacement is None:
             return many_directions(self.table)
         depth_m = self.given.depth_m

@@ -22,7 +22,7 @@ from virest.app.bench.workload import Scale, simulated
 from virest.app.diagnose import open_source
 from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.capture.video import GrayReader, probe_movie
-from virest.image_formation.point_model import TrackTable, ground, predict
+from virest.image_formation.point_model import TrackTable, integrate_motion, predict
 from virest.inference.coded_motion import AT_ONCE_PER_PX, BY_ROWS_PER_PX, drawn_px, step_slopes
 from virest.inference.guide_choice import track_guided
 from virest.inference.observed_tracks import observe_tracks
@@ -61,7 +61,7 @@ def _row(work: Path, scene: tuple[int, str], read: str, bits_per_px: float) -> R
     def fitted(term: Term, points: TrackTable) -> Array:
         return fit_tracks(capture.imu, points, profile, (term,), covariances=False).change
 
-    known = ground(capture.imu, profile, translation=False)
+    known = integrate_motion(capture.imu, profile, translation=False)
     slopes = step_slopes(known, seen, None, predict(known, seen, None))
     at_once, by_rows = np.split(drawn_px(slopes, seen.noise_px[seen.pair]), 2)
     axis = 0 if profile.shutter.reads_columns else 1

@@ -167,7 +167,7 @@ def _promises(
                 "frame": restored.frame.index,
                 "removed": gone,
                 "misplaced": np.stack((*misplaced.errors(gone), misplaced.weight)).tolist(),
-                "logarithms": confirmation.tellers(ideal, recorder.left).tolist(),
+                "logarithms": confirmation.gain_regressors(ideal, recorder.left).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
             }
 

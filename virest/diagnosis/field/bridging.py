@@ -16,7 +16,7 @@ from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.stretches import bridging_form, rate_walk, touching
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, make_evidence
 from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
-from virest.image_formation.point_model import TrackTable, ground
+from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.track_fit import start_scene
@@ -126,7 +126,7 @@ def _with_scene(evidence: Evidence, model: Model, table: TrackTable) -> Model:
     scene = model.scene
     if not isinstance(scene, InertialMotion) or scene.windows == table.n_windows:
         return model
-    known = ground(evidence.imu, model.profile, translation=True)
+    known = integrate_motion(evidence.imu, model.profile, translation=True)
     depth = float(np.median(np.linalg.norm(scene.plane_per_m, axis=1)))
     return replace(model, scene=start_scene(evidence.imu, known, table, depth))
 

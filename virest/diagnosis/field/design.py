@@ -76,7 +76,7 @@ class PointResiduals:
 
     def moved_by(self, profile: CameraProfile) -> Array:
         """Displacement (n, 2) of the predicted points under another profile, px."""
-        moved = with_profile(self.fit.ground, self.imu, profile)
+        moved = with_profile(self.fit.integrated, self.imu, profile)
         ahead = predict(moved, self.table, self.fit.scene, like=self.prediction)
         return ahead.second_px - self.prediction.second_px
 
@@ -101,7 +101,7 @@ class PointResiduals:
 def point_residuals(imu: ImuSamples, fit: TrackFit, table: TrackTable) -> PointResiduals:
     """The residuals of a fit, down-weighted along the parallax according to the spread of depths."""
     directed = isinstance(fit.scene, DirectedMotion)
-    at = predict(fit.ground, table, fit.scene, slopes=fit.scene is not None and not directed)
+    at = predict(fit.integrated, table, fit.scene, slopes=fit.scene is not None and not directed)
     way = shrink = None
     if at.along_px is not None:
         length = np.linalg.norm(at.along_px, axis=-1)

@@ -75,7 +75,7 @@ class ConfirmedGain:
         The deviation combines the uncertainty of the remaining error (LEFT_OVER_STD), of the removed error (the scatter
         of the share, and the disagreement of ``changed`` and ``lost``), and of the rows' displacement.
         """
-        left = float(np.exp(tellers(ideal, self.left) @ np.array(LEFT_OVER)))
+        left = float(np.exp(gain_regressors(ideal, self.left) @ np.array(LEFT_OVER)))
         gone = removed(changed, lost)
         before, after = errors(left, gone, *misplaced.errors(gone))
         gains_db = 10 * np.log10(before / after)
@@ -101,7 +101,7 @@ def removed(changed: float, lost: float) -> float:
     return float(np.sqrt(changed * max(lost, 0.0)))
 
 
-def tellers(ideal: float, left: float) -> Array:
+def gain_regressors(ideal: float, left: float) -> Array:
     """(3,) the regressors of :data:`LEFT_OVER`."""
     return np.asarray(np.log(np.maximum((np.e, ideal, left), 1e-6)))
 
