@@ -240,7 +240,7 @@ class PictureStatistics:
         return float(self._area() @ ((1 - passed) * power))
 
     def least_variance(self, samples: float) -> float:
-        """Standard deviation of the noise's own variance, as measured on so many samples."""
+        """Standard deviation of the noise's variance, measured on ``samples`` samples."""
         return self.variance_within_period(self.noise) * float(np.sqrt(2 / samples))
 
     def with_signal_variance(self, recorded: float, samples: float, shape: PictureStatistics) -> PictureStatistics:
