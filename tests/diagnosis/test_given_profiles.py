@@ -120,7 +120,7 @@ def test_blur_that_the_profile_has_is_no_cause(monkeypatch, given: tuple[float, 
     assert not blur_findings(monkeypatch, blurred(*given), given[0] + 0.01, given[1] + 0.02)
 
 
-@pytest.mark.parametrize(("scale", "sigma"), [(1.0, 0.02), (0.5, 3.2)])
+@pytest.mark.parametrize(("scale", "sigma"), [(1.0, 0.02), (1.0, 0.0), (0.5, 3.2)])
 def test_blur_is_named_as_a_change_of_the_profile(monkeypatch, scale: float, sigma: float) -> None:
     """More or less of both, in one fit of all held-out blocks."""
     found = {f.name: f for f in blur_findings(monkeypatch, blurred(0.8, 2.0), scale, sigma)}

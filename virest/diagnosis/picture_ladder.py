@@ -448,12 +448,14 @@ class _BlurChange:
 def _blur_changes(fitted: local_blur_fit.BlurFit, given: CameraProfile) -> tuple[_BlurChange, _BlurChange]:
     """The changes of exposure and defocus; NaN where the capture does not determine a value.
 
-    A small defocus hardly widens edges, so a defocus below the given one is tested by its variance in px².
+    A small defocus hardly widens edges, so a defocus below the given one is tested by its variance in px².  The square
+    of a normal value σ ± s has the variance 4 σ² s² + 2 s⁴, at σ = 0 too.
     """
     (scale, sigma), (scale_std, sigma_std) = np.concatenate(fitted.values).tolist(), fitted.std.tolist()
     before, sharp = given.shutter.exposure_scale, given.extensions.defocus_sigma_px
     longer = abs(float(np.log(scale / before)))
-    wider = (sigma - sharp) / sigma_std if sigma >= sharp else (sharp**2 - sigma**2) / (2 * sigma * sigma_std)
+    square_std = sigma_std * float(np.sqrt(4 * sigma**2 + 2 * sigma_std**2))
+    wider = (sharp**2 - sigma**2) / square_std if sigma < sharp else (sigma - sharp) / sigma_std
     return (
         _BlurChange(ParameterChange(before, scale, scale_std), longer, longer * scale / scale_std),
         _BlurChange(ParameterChange(sharp, sigma, sigma_std), abs(sigma - sharp), wider),
