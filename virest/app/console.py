@@ -160,3 +160,13 @@ def table(header: list[str], rows: list[list[str]], words: int = 2) -> str:
         return "  ".join(cells).rstrip()
 
     return "\n".join(line(row) for row in [header, *rows])
+
+
+def numeric_table(header: list[str], rows: list[list[str]]) -> str:
+    """Columns under their heads: the first left-aligned, the others, which hold numbers, right-aligned."""
+    return table(header, rows, words=0)
+
+
+def cell(value: float | None, form: str = ".2f") -> str:
+    """A number as a cell of a table, ``-`` for None; form: a format specification."""
+    return "-" if value is None else format(value, form)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.console import table
+from virest.app.console import cell, numeric_table
 from virest.diagnosis.findings import Diagnosis, Finding, Remaining
 from virest.diagnosis.restoration_gain import RestorationGain
 from virest.report.words import residual_words
@@ -25,7 +25,7 @@ def describe(name: str, found: Diagnosis, gain: RestorationGain, wrote: str) -> 
     ]
     if found.causes:
         header = ["cause", "parameter", "given", "found", "±", "before", "after", "gain"]
-        lines.append(table(header, [row for cause in found.causes for row in _rows(cause)], words=0))
+        lines.append(numeric_table(header, [row for cause in found.causes for row in _rows(cause)]))
         lines += [line for cause in found.causes for line in _sentences(cause)]
     for field in found.fields:
         lines.append(f"field: {_one_line(field.sentence)}")
@@ -46,8 +46,7 @@ def _sentences(cause: Finding) -> list[str]:
 def _rows(cause: Finding) -> list[list[str]]:
     """One row per number or word that changed; the first row also shows what the cause gains."""
     held_out = cause.held_out
-    gain = "-" if held_out.gain is None else f"{held_out.gain:.0%}"
-    judged = [_number(held_out.before), _number(held_out.after), gain]
+    judged = [_number(held_out.before), _number(held_out.after), cell(held_out.gain, ".0%")]
     values = [value for parameter, change in cause.parameters.items() for value in _values(parameter, change)]
     return [
         [cause.name if k == 0 else "", *value, *(judged if k == 0 else [""] * len(judged))]

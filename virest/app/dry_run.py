@@ -120,23 +120,13 @@ def _restored(
 
 
 def _table(forecasts: list[Forecast]) -> str:
-    def shown(value: float | None) -> str:
-        return "-" if value is None else f"{value:.1f}"
-
     rows = [
-        [
-            f.name,
-            str(f.frames),
-            str(f.skipped),
-            shown(f.blur_px),
-            shown(f.gain_db),
-            f"{f.seconds:.0f}",
-            f"{f.bytes / 1e6:.1f}",
-        ]
+        [f.name, str(f.frames), str(f.skipped), console.cell(f.blur_px, ".1f"), console.cell(f.gain_db, ".1f"),
+         f"{f.seconds:.0f}", f"{f.bytes / 1e6:.1f}"]
         for f in forecasts
-    ]
+    ]  # fmt: skip
     if len(forecasts) > 1:
         total_s, total = sum(f.seconds for f in forecasts), sum(f.bytes for f in forecasts)
         rows.append(["total", str(sum(f.frames for f in forecasts)), str(sum(f.skipped for f in forecasts)), "", "",
                      f"{total_s:.0f}", f"{total / 1e6:.1f}"])  # fmt: skip
-    return console.table(["capture", "frames", "skipped", "blur px", "gain dB", "time s", "MB"], rows, words=0)
+    return console.numeric_table(["capture", "frames", "skipped", "blur px", "gain dB", "time s", "MB"], rows)

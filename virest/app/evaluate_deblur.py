@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.console import table
+from virest.app.console import numeric_table
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, read_picture, write_png
 from virest.app.simulate import simulate_command
 from virest.camera.response import ResponseCurve
@@ -397,11 +397,11 @@ def _text(facts: Mapping[str, Any]) -> str:
     parts = [
         f"CASE {facts['case'].replace(':', ',')}: {facts['frames']} frames, {facts['versions']}",
         "means over frames; PSNR of the mean MSE",
-        _table(header, _rows(facts["methods"])),
+        numeric_table(header, _rows(facts["methods"])),
     ]
     if len(facts["by_capture"]) > 1:
         for name, part in facts["by_capture"].items():
-            parts += [f"\n{name}: {next(iter(part.values()))['frames']} frames", _table(header, _rows(part))]
+            parts += [f"\n{name}: {next(iter(part.values()))['frames']} frames", numeric_table(header, _rows(part))]
     parts += ["", *_account(facts)]
     return "\n".join(parts)
 
@@ -436,8 +436,3 @@ def _account(facts: Mapping[str, Any]) -> list[str]:
         lines.append(f"{s['capture']}: seed {s['seed']}, {s['width']}x{s['height']}, {s['frames']} frames, exposure "
                      f"{s['exposure_ms'][0]:g} ms, readout {s['readout_ms']:g} ms, blur {s['blur_px']} px")  # fmt: skip
     return lines
-
-
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    """Right-align all numbers: two empty columns take the place of the console table's left-aligned last two."""
-    return table([*header, "", ""], [[*row, "", ""] for row in rows])

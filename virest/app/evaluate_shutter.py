@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.console import table
+from virest.app.console import cell, numeric_table
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, write_png
 from virest.errors import CaptureError
 from virest.evaluation.angles import Rectangle, largest_rectangle, neighbour_angles_rad, quadrilateral_angles_rad
@@ -351,19 +351,18 @@ def _example_table(example: Mapping[str, Any]) -> str:
     for method, angle in example["angle_deg"].items():
         apart = abs(angle - static)
         rows.append([method, f"{angle:.2f}", f"{apart:.3f}", f"{100 * apart / static:.3f}"])
-    return _table(["picture", "angle", "absolute", "relative %"], rows)
+    return numeric_table(["picture", "angle", "absolute", "relative %"], rows)
 
 
 def _angle_table(summary: Mapping[str, Any], key: str) -> str:
     rows = [[method, *_angle_cells(found[key])] for method, found in summary["methods"].items()]
     rows.append(["(detector on truth)", *_angle_cells(summary["detector_on_truth"][key])])
-    return _table(["method", "mean", "std", "max", "relative %", "angles"], rows)
+    return numeric_table(["method", "mean", "std", "max", "relative %", "angles"], rows)
 
 
 def _angle_cells(found: Mapping[str, Any]) -> list[str]:
     numbers = [f"{found[name]:.4f}" for name in ("mean_abs_deg", "std_deg", "max_abs_deg")]
-    relative = found.get("mean_relative_percent")
-    return [*numbers, "-" if relative is None else f"{relative:.4f}", str(found["count"])]
+    return [*numbers, cell(found.get("mean_relative_percent"), ".4f"), str(found["count"])]
 
 
 def _fidelity_table(summary: Mapping[str, Any]) -> str:
@@ -371,7 +370,7 @@ def _fidelity_table(summary: Mapping[str, Any]) -> str:
         [method, f"{found['mse']:.2f}", f"{found['psnr_db']:.2f}", f"{found['ssim']:.4f}"]
         for method, found in summary["methods"].items()
     ]
-    return _table(["method", "MSE", "PSNR dB", "SSIM"], rows)
+    return numeric_table(["method", "MSE", "PSNR dB", "SSIM"], rows)
 
 
 def _capture_table(by_capture: Mapping[str, Any]) -> str:
@@ -379,7 +378,7 @@ def _capture_table(by_capture: Mapping[str, Any]) -> str:
         [name, str(part["frames"]), *(f"{part['methods'][m]['outer']['mean_abs_deg']:.4f}" for m in METHODS)]
         for name, part in by_capture.items()
     ]
-    return _table(["capture", "frames", *METHODS], rows)
+    return numeric_table(["capture", "frames", *METHODS], rows)
 
 
 def _account(facts: Mapping[str, Any]) -> str:
@@ -395,8 +394,3 @@ def _account(facts: Mapping[str, Any]) -> str:
     lines += [f"{name}: board not found in {n['without_board']} more frames"
               for name, n in facts["captures"].items() if n["without_board"]]  # fmt: skip
     return "\n".join([*lines, *(f"wrote {path}" for path in facts["maps"])])
-
-
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    """Right-align all numbers: two empty columns take the place of the console table's left-aligned last two."""
-    return table([*header, "", ""], [[*row, "", ""] for row in rows])

@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, real_captures, simulated
 from virest.app.calibrate import CalibrationOutput, plan_calibration, run_calibration
+from virest.app.console import numeric_table
 from virest.app.diagnose import DiagnosisOptions, run_diagnosis
 from virest.errors import VirestError
 
@@ -37,7 +37,7 @@ def broken_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     ]
     faults = [row for row in rows if "fault" in (row["diagnose"], row["calibrate"])]
     header = ["capture", "broken", "diagnose", "calibrate"]
-    text = table(header, [[row[key] for key in header] for row in rows])
+    text = numeric_table(header, [[row[key] for key in header] for row in rows])
     return {
         "rows": rows,
         "faults": len(faults),

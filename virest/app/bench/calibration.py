@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale
 from virest.app.calibrate import plan_calibration
+from virest.app.console import numeric_table
 from virest.app.simulate import simulate_command
 from virest.calibration.calibrated_values import CalibratedValue
 from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
@@ -56,7 +56,7 @@ def calibration_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     summary = {name: summed([row for row in rows if row["value"] == name]) for name in names}
     header = ["value", "errors", "median |e|/σ", "within 2σ", "mean e/σ", "share implied", "share used",
               "e/σ below -3, -2, -1, 0, 1, 2, 3, above"]  # fmt: skip
-    text = table(header, [_shown(name, one) for name, one in summary.items()])
+    text = numeric_table(header, [_shown(name, one) for name, one in summary.items()])
     if scale.figures is not None:
         ratios = {name: [row["error_in_std"] for row in rows if row["value"] == name] for name in names}
         title = f"Errors of calibrate in standard deviations, {seeds} simulated captures"

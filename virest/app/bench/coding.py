@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, simulated
+from virest.app.console import numeric_table
 from virest.app.diagnose import open_source
 from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.capture.video import GrayReader, probe_movie
@@ -95,7 +95,8 @@ def _text(rows: list[Row]) -> str:
             [name, "", "", "", "", "", _asked([row for row in rows if row["read"] in read], "by_rows"), "", ""]
         )
     in_use = f"in use: by rows {BY_ROWS_PER_PX}, at once {AT_ONCE_PER_PX} (left, above)"
-    return f"CODING: points pulled to the motion of the blocks above and to the left; {in_use}\n{table(header, lines)}"
+    title = f"CODING: points pulled to the motion of the blocks above and to the left; {in_use}\n"
+    return title + numeric_table(header, lines)
 
 
 def _asked(rows: list[Row], kind: str) -> str:

@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, Timing, looped_capture, simulated, timed
+from virest.app.console import numeric_table
 
 HELP_TRIES, INSPECT_TRIES = 5, 2
 """Number of runs, of which the fastest counts; before ``--help`` one extra run fills the system's caches."""
@@ -113,6 +113,7 @@ def commands_text(rows: list[Facts]) -> str:
         found = [f"{row['wall_s']:.2f}", f"{row['cpu_s']:.2f}", f"{row['part_of_asked']:.2f}", others]
         lines.append([row["title"], f"{row['asked_s']:g}", *found])
     header = ["command", "target s", "wall s", "CPU s", "wall / target", "others' cores"]
-    return "COMMANDS: from start to exit; the target of calibrate and diagnose is the capture's length\n" + table(
-        header, lines
+    return (
+        "COMMANDS: from start to exit; the target of calibrate and diagnose is the capture's length\n"
+        + numeric_table(header, lines)
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from virest.app.bench.tables import table
+from virest.app.console import cell, numeric_table
 
 Report = dict[str, Any]
 NAMES = (
@@ -84,13 +84,13 @@ def compared(old: Report, new: Report, noise: float = NOISE) -> list[Change]:
 def compare_text(old: Report, new: Report, noise: float = NOISE) -> str:
     """Differences of machines and versions, then all common figures, then sections in only one report."""
     changes = compared(old, new, noise)
-    rows = [[c.name, f"{c.old:.6g}", f"{c.new:.6g}", _ratio_text(c), c.mark] for c in changes]
+    rows = [[c.name, f"{c.old:.6g}", f"{c.new:.6g}", cell(c.ratio, ".3f"), c.mark] for c in changes]
     flagged = sum(bool(change.mark) for change in changes)
     title = (
         f"COMPARE: {len(changes)} figures, {flagged} changed by more than the noise ({100 * noise:.0f} %; memory "
         f"{100 * min(noise, MEMORY_NOISE):.0f} %; decibels by {NOISE_DB} dB)\n"
     )
-    body = table(["figure", "old", "new", "new / old", ""], rows) if rows else "no figure in common"
+    body = numeric_table(["figure", "old", "new", "new / old", ""], rows) if rows else "no figure in common"
     return "\n".join([*differences(old, new), title + body, *_only_one(old, new)])
 
 
@@ -193,7 +193,3 @@ def better_direction(name: str) -> int:
             if any(plain == word or (word.startswith("_") and plain.endswith(word)) for word in words):
                 return direction
     return 0
-
-
-def _ratio_text(change: Change) -> str:
-    return "-" if change.ratio is None else f"{change.ratio:.3f}"

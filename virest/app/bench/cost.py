@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from virest.app.bench.speed import JOBS
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, looped_capture, run_process
+from virest.app.console import numeric_table
 
 CAPTURES, MINUTES, FPS = 10_000, 5, 30
 DOLLARS_PER_CORE_HOUR = 0.04
@@ -75,5 +75,5 @@ def _text(facts: dict[str, Any], rows: list[dict[str, Any]]) -> str:
     return (
         f"COST: {CAPTURES:,} captures of {MINUTES} minutes, 720x1280 at {FPS} frames/s: {facts['frames']:,} frames, "
         f"{facts['movie_tb']:.1f} TB of movies in, {facts['pictures_tb']:.0f} TB of PNGs out (${month:,.0f} a month)\n"
-        + table(header, lines)
+        + numeric_table(header, lines)
     )

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Picture, Scale, recorded_frames, simulated, truth_frame
+from virest.app.console import cell, numeric_table
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import read_capture, resolve_profile
 from virest.evaluation.fidelity import MARGIN_PX
@@ -222,7 +222,7 @@ def _curves_text(rows: list[dict[str, Any]]) -> str:
     return (
         "CURVES: mean PSNR in dB against truth, gain over straightening alone, and what the right curve adds\n"
         f"(preset balanced; toe and shoulder hold {toe:.0%} and {shoulder:.0%} of the pixels; min: over all frames)\n"
-        + table(head, cells)
+        + numeric_table(head, cells)
     )
 
 
@@ -230,9 +230,10 @@ def _clipping_text(rows: list[dict[str, Any]]) -> str:
     head = ["clipped light", "restored", "clipped", "near it", "elsewhere", "whole"]
     cells = [
         [row["scene"], row["told"], f"{row['clipped']:.1%}",
-         *("-" if row[key] is None else f"{row[key]:.2f}" for key in ("near_db", "elsewhere_db", "whole_db"))]
+         *(cell(row[key]) for key in ("near_db", "elsewhere_db", "whole_db"))]
         for row in rows
     ]  # fmt: skip
-    return "CLIPPED LIGHT: mean PSNR in dB, near it (within a blur path, not clipped itself) and elsewhere\n" + table(
-        head, cells
+    return (
+        "CLIPPED LIGHT: mean PSNR in dB, near it (within a blur path, not clipped itself) and elsewhere\n"
+        + numeric_table(head, cells)
     )

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale
+from virest.app.console import numeric_table
 from virest.app.diagnose import open_source
 from virest.app.simulate import simulate_command
 from virest.diagnosis.catalogue import CATALOGUE
@@ -40,7 +40,7 @@ def diagnosis_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         "within_two_std": float(np.mean(np.array(ratios) < 2)) if ratios else None,
     }
     header = ["hidden", "seed", "verdict", "named", "gain", "|error| / std"]
-    text = table(header, [_shown(row) for row in rows])
+    text = numeric_table(header, [_shown(row) for row in rows])
     text += f"\n{len(right)} of {len(rows)} right; median |error| / std {summary['median_error_in_std']}"
     return {"summary": summary, "rows": rows}, f"Hidden effects, {FRAMES} frames, 640x480 and 480x640\n{text}"
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, simulated
+from virest.app.console import numeric_table
 from virest.app.diagnose import open_source
 from virest.diagnosis.local_blur import look_for_blur
 from virest.diagnosis.local_blur_fit import Defocus, fit
@@ -97,7 +97,8 @@ def _soft_text(rows: list[Row]) -> str:
     off = np.array([row["told_px"] / row["sigma_px"] - 1 for row in estimated])
     return (
         f"DEFOCUS, px: relative error {np.mean(off):+.3f} in the mean, rms {np.sqrt(np.mean(off**2)):.3f},\n"
-        f"in {len(estimated)} of {len(rows)} captures\n" + table(["hidden", "scene", "edges", "estimated"], lines)
+        f"in {len(estimated)} of {len(rows)} captures\n"
+        + numeric_table(["hidden", "scene", "edges", "estimated"], lines)
     )
 
 
@@ -149,7 +150,7 @@ def _text(groups: list[list[Row]]) -> str:
     return (
         "EDGES: overshoot beside flat plateaus, as a fraction of the step, mean ± deviation between captures;\n"
         "how often a phone's sharpening is detected, the mask fitted to the sharpest edges, and the amount undone\n"
-        + table(header, lines)
+        + numeric_table(header, lines)
     )
 
 

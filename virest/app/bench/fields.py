@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, run_process, truth_frame
+from virest.app.console import cell, numeric_table
 from virest.app.diagnose import Source, open_source
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import write_profile
@@ -422,7 +422,7 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     }
     header = ["hidden", "seed", "size", "verdict", "causes", "fields", "gain", "elsewhere", "frames dB",
               "rms / noise px", "CPU s"]  # fmt: skip
-    text = table(header, [shown(row) for row in rows])
+    text = numeric_table(header, [shown(row) for row in rows])
     text += (
         f"\n{summary['right']} of {summary['captures']} right; {summary['solved_elsewhere']} of "
         f"{summary['of_elsewhere']} solved on another capture; frames better in {summary['pictures_better']} of "
@@ -435,7 +435,7 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
 def shown(row: Row) -> list[str]:
     """A row of the table."""
     fields = "; ".join(f"{kind} over {over}: {shape}" for kind, over, shape in row["fields"])
-    gains = " ".join("-" if gain is None else f"{gain:.2f}" for gain in row["gain"])
+    gains = " ".join(cell(gain) for gain in row["gain"])
     elsewhere = "" if row["gone_elsewhere"] is None else f"{row['gone_elsewhere']:.2f}"
     db = row["pictures_db"]
     pictures = f"{np.mean(db):+.2f} ({min(db):+.2f})" if db else ""

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, Workload, honesty_workloads, simulated
-from virest.app.console import CONSOLE
+from virest.app.console import CONSOLE, numeric_table
 from virest.app.evaluation_captures import TrueCapture, open_true_capture
 from virest.evaluation.fidelity import psnr_db
 from virest.restoration.capture import RestorationPlan
@@ -236,7 +235,7 @@ def _text(promise: Row, best: dict[str, Row], swept: dict[str, tuple[Sequence[fl
     return (
         f"FITS: {promise['frames']} frames of {promise['captures']} captures with separate seeds\n"
         f"median |predicted - measured gain| of the best fit: {promise['off_db']:.2f} dB\n"
-        + table(header, lines)
+        + numeric_table(header, lines)
         + "\n"
         + "\n".join(curves)
     )

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from virest.app.bench.speed import JOBS, timed_difference
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, looped_capture, run_process
+from virest.app.console import numeric_table
 
 PRESET = "fast"
 FRAMES, QUICK_FRAMES = 100, 40
@@ -142,11 +142,11 @@ def growth_text(facts: Facts) -> str:
     return (
         f"GROWTH: preset {facts['preset']}; ms per frame without start-up and planning; time grows as size^p\n"
         f"frames: p = {exponent_text(frames)} (1: the time per frame does not depend on the movie's length)\n"
-        + table(["frames", "wall s", "CPU s", "ms per added frame", "CPU ms per added frame"], counted)
+        + numeric_table(["frames", "wall s", "CPU s", "ms per added frame", "CPU ms per added frame"], counted)
         + f"\n\npixels: p = {exponent_text(pixels)} of the CPU time; blur paths grow with the picture's side\n"
-        + table(["size", "pixels", "ms per frame", "CPU ms"], sized)
+        + numeric_table(["size", "pixels", "ms per frame", "CPU ms"], sized)
         + f"\n\ntiles: p = {exponent_text(tiles)} of the CPU time of deblurring; tiles by tile_px\n"
-        + table(["tile_px", "tiles", "CPU ms per frame", "deblurring"], tiled)
+        + numeric_table(["tile_px", "tiles", "CPU ms per frame", "deblurring"], tiled)
     )
 
 

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.tables import decibels, table
 from virest.app.bench.workload import Scale, Workload, honesty_workloads, run_process, simulated, truth_frame
-from virest.app.console import emit
+from virest.app.console import cell, emit, numeric_table
 from virest.evaluation.fidelity import psnr_db
 
 Row = dict[str, Any]
@@ -75,8 +74,8 @@ def frames_text(rows: Sequence[Row], presets: Sequence[str]) -> str:
         start = [row["capture"], str(row["frame"]), f"{row['blur_px']:.1f}", f"{row['straightened_db']:.2f}"]
         cells = lines.setdefault(row["frame"], start)
         mark = " !" if row["gain_db"] < -WORSE_DB else ""
-        cells.append(f"{decibels(row['promise_db'])} / {decibels(row['gain_db'])}{mark}")
-    return table(header, list(lines.values()))
+        cells.append(f"{cell(row['promise_db'], '+.2f')} / {cell(row['gain_db'], '+.2f')}{mark}")
+    return numeric_table(header, list(lines.values()))
 
 
 def honesty_text(summary: Sequence[Row]) -> str:
@@ -87,7 +86,7 @@ def honesty_text(summary: Sequence[Row]) -> str:
     return (
         f"HONESTY: gain in dB over straightening alone; worse: frames that lose more than {WORSE_DB} dB\n"
         "(predicted: frames with an expected_gain_db; |error|: median of their |predicted - measured gain|)\n"
-        + table(header, lines)
+        + numeric_table(header, lines)
     )
 
 
@@ -133,17 +132,16 @@ def _summary(kind: str, name: str | None, preset: str, rows: Sequence[Row]) -> R
 
 
 def _summary_cells(entry: Row) -> list[str]:
-    off = "-" if entry["promise_off"] is None else f"{entry['promise_off']:.2f}"
     return [
         entry["capture"] or f"ALL {entry['set'].upper()}",
         entry["preset"],
         str(entry["of"]),
         str(entry["deblurred"]),
-        decibels(entry["mean_gain_db"]),
+        cell(entry["mean_gain_db"], "+.2f"),
         f"{100 * entry['worse_share']:.0f} %",
-        decibels(entry["worse_mean_db"]),
-        decibels(entry["worst_db"]),
+        cell(entry["worse_mean_db"], "+.2f"),
+        cell(entry["worst_db"], "+.2f"),
         str(entry["promised"]),
-        off,
+        cell(entry["promise_off"]),
         str(entry["promised_and_worse"]),
     ]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, looped_capture, process_command
+from virest.app.console import numeric_table
 
 FRAMES = (100, 600)
 QUICK_FRAMES = (20, 60)
@@ -72,7 +72,7 @@ def memory_text(facts: dict[str, Any]) -> str:
     header = ["frames", "largest worker MB", "main process MB", "all together MB", "seconds"]
     return (
         f"MEMORY: peaks of resident memory, 720x1280, --preset {facts['preset']} --jobs 2\n"
-        + table(header, rows)
+        + numeric_table(header, rows)
         + "\nlongest movie over shortest: worker {worker:.3f}, all together {peak:.3f}".format(**facts["grown"])
     )
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from virest.app.bench.peers import PEERS, frame_motions, peer_pictures
-from virest.app.bench.tables import decibels, table
 from virest.app.bench.workload import (
     PRESETS,
     Scale,
@@ -19,7 +18,7 @@ from virest.app.bench.workload import (
     simulated,
     truth_frame,
 )
-from virest.app.console import CONSOLE
+from virest.app.console import CONSOLE, cell, numeric_table
 from virest.evaluation.fidelity import psnr_db
 
 METHODS = (*PRESETS, *PEERS)
@@ -114,15 +113,14 @@ def _text(summary: list[dict[str, Any]]) -> str:
     means, minima = [], []
     for entry in shown:
         name = entry["capture"] or f"ALL {KIND_TITLES[entry['kind']]}"
-        straight = "-" if entry["straightened_db"] is None else f"{entry['straightened_db']:.2f}"
-        gains = [decibels(entry["mean_gain_db"][method]) for method in METHODS]
-        means.append([name, f"{entry['frames']}/{entry['of']}", straight, *gains])
-        minima.append([name, str(entry["of"]), *(decibels(entry["min_gain_db"][preset]) for preset in PRESETS)])
+        gains = [cell(entry["mean_gain_db"][method], "+.2f") for method in METHODS]
+        means.append([name, f"{entry['frames']}/{entry['of']}", cell(entry["straightened_db"]), *gains])
+        minima.append([name, str(entry["of"]), *(cell(entry["min_gain_db"][preset], "+.2f") for preset in PRESETS)])
     return (
         "QUALITY: mean PSNR gain in dB over straightening alone, inside valid_px less 16 px\n"
         "(over the frames whose blur is in range; peers: true centre kernel, linear light,\n"
         " blended border, same warp, best setting for each frame by PSNR against truth)\n"
-        + table(["capture", "frames", "straight dB", *(SHORT.get(method, method) for method in METHODS)], means)
+        + numeric_table(["capture", "frames", "straight dB", *(SHORT.get(method, method) for method in METHODS)], means)
         + "\n\nthe same for the worst frame, at any blur\n"
-        + table(["capture", "of", *PRESETS], minima)
+        + numeric_table(["capture", "of", *PRESETS], minima)
     )

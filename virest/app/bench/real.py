@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, real_captures, run_process
 from virest.app.calibrate import plan_calibration
+from virest.app.console import numeric_table
 from virest.app.diagnose import climb_as_command, open_source
 from virest.calibration.geometry import calibrate_geometry
 from virest.capture.video import GrayReader, probe_movie
@@ -41,9 +41,11 @@ def real_section(work: Path, _scale: Scale) -> tuple[dict[str, Any], str]:
     calibrated = [row for name, extra in CALIBRATED.items() for row in _calibrated(root / name, extra)]
     diagnosed = [row for name in DIAGNOSED for row in _diagnosed(root / name)]
     diagnosed += [row for name in ON_TIME for row in _diagnosed(root / name, offset_s=0.0)]
-    text = table(["process", "frames", *COUNTED, "verdict"], processed)
-    text += "\n\n" + table(["calibrate", "value", "found", "std", "determined"], calibrated)
-    text += "\n\n" + table(["diagnose", "verdict", "cause", "found", "std", "before", "after", "rivals"], diagnosed)
+    text = numeric_table(["process", "frames", *COUNTED, "verdict"], processed)
+    text += "\n\n" + numeric_table(["calibrate", "value", "found", "std", "determined"], calibrated)
+    text += "\n\n" + numeric_table(
+        ["diagnose", "verdict", "cause", "found", "std", "before", "after", "rivals"], diagnosed
+    )
     return {"process": processed, "calibrate": calibrated, "diagnose": diagnosed}, f"Measured captures\n{text}"
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, recorded_frames, run_process, simulated, truth_frame
+from virest.app.console import numeric_table
 from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.evaluation.fidelity import point_distances_px
 
@@ -27,7 +27,7 @@ def shutter_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         for r in results
     ]
     title = "SHUTTER: distance in px of tracked points from truth (exposure 1 ms, readout 20 ms, rate 1.5 rad/s)\n"
-    return {"captures": results}, title + table(header, rows)
+    return {"captures": results}, title + numeric_table(header, rows)
 
 
 def _measure(work: Path, size: str, direction: str, frames: int) -> dict[str, Any]:

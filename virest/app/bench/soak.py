@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from virest.app.bench.memory import resident_bytes, run_sampled
-from virest.app.bench.tables import table
 from virest.app.bench.workload import Scale, simulated
+from virest.app.console import numeric_table
 
 CAPTURES, QUICK_CAPTURES = 200, 20
 BROKEN_EVERY = 10
@@ -203,4 +203,4 @@ def _text(facts: dict[str, Any]) -> str:
     ]
     title = f"SOAK: {facts['captures']} captures in one run, {facts['seconds']:.0f} s; second quarter -> last quarter\n"
     explanations = "\n".join(f"  {defect}: {line[:150]}" for defect, line in facts["explanations"].items())
-    return title + table(["what", "found", "expected"], rows) + "\n" + explanations
+    return title + numeric_table(["what", "found", "expected"], rows) + "\n" + explanations

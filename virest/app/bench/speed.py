@@ -24,8 +24,8 @@ from virest.app.bench.peers import (
     frame_motions,
     peer_deblurred,
 )
-from virest.app.bench.tables import table
 from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recorded_frames, run_process
+from virest.app.console import cell, numeric_table
 from virest.app.doctor import processor
 from virest.app.worker_processes import prepare_worker
 from virest.capture.folder import read_capture, resolve_profile
@@ -220,11 +220,11 @@ def _program_text(facts: Facts) -> str:
     for entry in [facts["floor"], *facts["presets"]]:
         one = entry["one_process"]
         rows.append([
-            entry["preset"], figure(entry["frames_per_s"]), figure(entry["frames_per_s_by_cpu"]),
+            entry["preset"], cell(entry["frames_per_s"]), cell(entry["frames_per_s_by_cpu"]),
             percent(entry["share_of_floor"]), percent(entry["share_of_floor_by_cpu"]),
             percent(entry["share_of_floor_by_stages"]), *(stage_rate(entry["stage_cpu_s"][stage]) for stage in STAGES),
             percent(entry["estimate_share"]), percent(entry["estimate_share_with_planning"]),
-            figure(one["frames_per_s"]), figure(entry["scaling"]), figure(entry["scaling_by_cpu"]),
+            cell(one["frames_per_s"]), cell(entry["scaling"]), cell(entry["scaling_by_cpu"]),
             f"{1000 * entry['cpu_s_per_frame']:.0f}", f"{entry['busiest_others_cores']:.1f}",
         ])  # fmt: skip
     planned = f"its {facts['planning_cpu_s']:.1f} s in a capture of {CAPTURE_S:.0f} s"
@@ -235,7 +235,7 @@ def _program_text(facts: Facts) -> str:
         "from runs over N and 2 N frames\n"
         f"(floor: --deblur none, {pure}; by stages: decode + shutter + write of the preset's own run;\n"
         f" by CPU: what the CPU times allow; stages: frames/s of one core by CPU time; with planning: {planned};\n"
-        " others' cores: load by other processes)\n" + table(header, rows)
+        " others' cores: load by other processes)\n" + numeric_table(header, rows)
     )
 
 
@@ -244,12 +244,12 @@ def _peers_text(facts: Facts) -> str:
     rows = []
     for name, seconds in facts["peers_s_per_frame"].items():
         ratios = [ratio_to_peer(seconds, entry) for entry in presets]
-        rows.append([name, f"{1000 * seconds:.0f}", *("-" if r is None else f"{r:.1f}" for r in ratios)])
+        rows.append([name, f"{1000 * seconds:.0f}", *(cell(r, ".1f") for r in ratios)])
     rows += [[name, why, *("-" for _ in presets)] for name, why in facts["peers_missing"].items()]
     return (
         "PEERS: one colour frame deblurred on one core, CPU ms; then as a multiple of the deblur stage's\n"
         "(scikit-image and deepinv with one kernel for the whole frame)\n"
-        + table(["peer", "ms", *(f"/ {entry['preset']}" for entry in presets)], rows)
+        + numeric_table(["peer", "ms", *(f"/ {entry['preset']}" for entry in presets)], rows)
     )
 
 
@@ -262,11 +262,6 @@ def ratio_to_peer(peer_s: float, entry: Facts) -> float | None:
 def stage_rate(seconds: float) -> str:
     """Frames per second of one stage on one core."""
     return f"{1 / seconds:.4g}" if seconds > LEAST_S else "-"
-
-
-def figure(value: float | None) -> str:
-    """A rate or a ratio as text."""
-    return "-" if value is None else f"{value:.2f}"
 
 
 def percent(share: float | None) -> str:

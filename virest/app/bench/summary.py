@@ -8,8 +8,8 @@ from typing import Any
 
 from virest.app.bench.compare import BUSY_CORES
 from virest.app.bench.growth import exponent_text
-from virest.app.bench.speed import STAGES, figure, percent, ratio_to_peer, stage_rate
-from virest.app.bench.tables import table
+from virest.app.bench.speed import STAGES, percent, ratio_to_peer, stage_rate
+from virest.app.console import cell, numeric_table
 
 Report = dict[str, Any]
 LEAST_FLOOR_SHARE, LEAST_SCALING, MOST_ESTIMATION = 0.6, 1.8, 0.05
@@ -61,7 +61,9 @@ def summary_text(report: Report) -> str:
         return ""
     versions = report.get("versions", {})
     load = f"{versions.get('cores')} cores, load {versions.get('load', 0.0):.1f} at the start"
-    body = table(["figure", "target", "measured", "met"], [[r.figure, r.target, r.measured, r.met] for r in rows])
+    body = numeric_table(
+        ["figure", "target", "measured", "met"], [[r.figure, r.target, r.measured, r.met] for r in rows]
+    )
     return f"SUMMARY: virest {versions.get('virest')}, scale {report.get('scale')}, {load}\n" + body
 
 
@@ -80,7 +82,7 @@ def _speed_rows(speed: Report) -> list[Row]:
 
 def _rate_row(entry: Report) -> Row:
     rate, allowed, least = entry["frames_per_s"], entry["frames_per_s_by_cpu"], LEAST_RATE.get(entry["preset"])
-    title, measured = f"{entry['preset']}: frames/s, 2 processes", f"{figure(rate)} ({figure(allowed)} by CPU time)"
+    title, measured = f"{entry['preset']}: frames/s, 2 processes", f"{cell(rate)} ({cell(allowed)} by CPU time)"
     if least is None:
         return Row(title, OPEN, measured)
     return Row(title, f">= {least:g}", measured, judge((rate or 0) >= least, allowed >= least, _others(entry)))
@@ -100,7 +102,7 @@ def _floor_row(entry: Report) -> Row:
 def _scaling_row(entry: Report) -> Row:
     scaling, allowed = entry["scaling"], entry["scaling_by_cpu"]
     met = judge((scaling or 0.0) >= LEAST_SCALING, allowed >= LEAST_SCALING, _others(entry), ratio=True)
-    measured = f"{figure(scaling)} ({figure(allowed)} by CPU time)"
+    measured = f"{cell(scaling)} ({cell(allowed)} by CPU time)"
     return Row(f"{entry['preset']}: 1 -> 2 processes", f">= {LEAST_SCALING:g}", measured, met)
 
 
