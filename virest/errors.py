@@ -18,6 +18,9 @@ from __future__ import annotations
 
 from typing import Any
 
+PARTLY_FAILED = 9
+"""Exit code of a batch of which a part failed, and of a capture some of whose frames failed."""
+
 
 class VirestError(Exception):
     """What went wrong (message), what to do next (hint), and the numbers behind it (facts)."""

@@ -17,11 +17,10 @@ from virest.app.planning import Job, ProcessOptions
 from virest.app.run_folder import parse_lines
 from virest.camera.profile_file import profile_mapping
 from virest.capture.location import is_remote, locate, read_each
-from virest.errors import VirestError
+from virest.errors import PARTLY_FAILED, VirestError
 from virest.image_formation import transforms
 from virest.restoration.capture import RestorationPlan
 
-PARTLY_FAILED = 9
 STATUSES = ("restored", "copied", "skipped", "failed")
 STEPS = ("deblurred", "straightened", "undistorted")
 """Steps counted in addition to the four statuses; a copied frame may be undistorted."""

@@ -6,11 +6,11 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-from virest.errors import OutputError, VirestError
+from virest.errors import PARTLY_FAILED, OutputError, VirestError
 
 OUR_FAULT = "this is a bug in virest, not in your input; please report it with the lines above"
 MOVIE_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".insv", ".360")
@@ -86,6 +86,12 @@ def report_error(error: BaseException, about: str = "") -> int:
     text = str(error) if known else f"{type(error).__name__}: {error}; {OUR_FAULT}"
     CONSOLE.line(f"error: {about}: {text}" if about and about not in text else f"error: {text}")
     return error.exit_code if isinstance(error, VirestError) else 1
+
+
+def batch_code(codes: Sequence[int]) -> int:
+    """The exit code of a batch: the capture's own for one capture, PARTLY_FAILED if any of several failed."""
+    failures = [code for code in codes if code]
+    return 0 if not failures else failures[0] if len(codes) == 1 else PARTLY_FAILED
 
 
 def emit(text: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from virest.app.diagnosis_text import SHOWN_COMPONENTS, describe
 from virest.app.field_record import field_record
-from virest.app.outputs import capture_name, output_error, plain, write_whole
+from virest.app.outputs import capture_name, json_text, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import format_profile, profile_mapping
@@ -122,7 +121,7 @@ def run_diagnosis(
     files, drawn = draw_figures(source.capture, found, each)
     facts = as_json(found, gain, drawn)
     files[EXTENDED] = extended_text(source.capture.name, found).encode()
-    files[DIAGNOSIS] = (json.dumps(facts, allow_nan=False, indent=2) + "\n").encode()
+    files[DIAGNOSIS] = json_text(facts).encode()
     _write_all(folder, files)
     say("done", 1.0)
     text = describe(source.capture.name, found, gain, f"{folder / DIAGNOSIS}, {EXTENDED} and figures")

@@ -7,12 +7,11 @@ import platform
 import shutil
 import time
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from virest import __version__
-from virest.app.cli.options import cores
+from virest.app.machine import cores, installed_version, processor
 
 if TYPE_CHECKING:
     from virest.image_formation.transforms import Transform
@@ -41,8 +40,8 @@ def examine() -> tuple[Json, str, int]:
         "virest": __version__,
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
-        "packages": {name: _version(name) for name in NEEDED},
-        "extras": {name: all(_version(package) for package in packages) for name, packages in EXTRAS.items()},
+        "packages": {name: installed_version(name) for name in NEEDED},
+        "extras": {name: all(installed_version(package) for package in packages) for name, packages in EXTRAS.items()},
         "processor": processor(),
         "cores": cores(),
         "memory_bytes": _memory_bytes(),
@@ -56,13 +55,6 @@ def examine() -> tuple[Json, str, int]:
     facts["missing"] = missing
     facts["notes"] = _notes(facts)
     return facts, _describe(facts), 1 if missing else 0
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _memory_bytes() -> int | None:
@@ -119,16 +111,6 @@ def _tile_s(forward: Transform, inverse: Transform) -> float:
             inverse(forward(tile, spectrum), back)
         times.append(time.process_time() - began)
     return round(min(times) / TILE_TRANSFORMS, 7)
-
-
-def processor() -> str | None:
-    """The processor's name as Linux, or else Python, reports it; None if neither does."""
-    with suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-        if names:
-            return names[0]
-    return platform.processor() or None
 
 
 def _notes(facts: Json) -> list[str]:

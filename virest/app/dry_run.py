@@ -22,7 +22,6 @@ from virest.restoration.capture import RestorationPlan, at_true_times, restore_f
 
 PROBED = 3
 """Frames restored per capture; the first does not count for the time, since it also builds tables."""
-PARTLY_FAILED = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +60,7 @@ def predict_captures(paths: list[str], options: ProcessOptions, shard: tuple[int
             codes.append(console.report_error(error, name))
     if forecasts and not options.json_lines:
         console.emit(_table(forecasts))
-    failures = [code for code in codes if code]
-    return 0 if not failures else failures[0] if len(codes) == 1 else PARTLY_FAILED
+    return console.batch_code(codes)
 
 
 def predict(path: str, name: str, options: ProcessOptions) -> Forecast:

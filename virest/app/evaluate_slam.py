@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ import numpy as np
 
 from virest import __version__
 from virest.app import console
+from virest.app.machine import installed_version
 from virest.app.outputs import json_line
 from virest.app.slam_captures import (
     DEVICE_FRAMES,
@@ -47,7 +47,6 @@ log = logging.getLogger(__name__)
 SEEDS = 3
 QUICK_FRAMES, QUICK_DEVICES = 24, 2
 TIMEOUT_S = 600.0
-PARTLY_FAILED = 9
 Progress = Callable[[str, float], None]
 
 
@@ -98,9 +97,7 @@ def run_slam(
         facts["summary"] = _summary(rows)
         if options.out:
             (out / "results.json").write_text(json_line(facts) + "\n", encoding="utf-8")
-    codes = [row["exit_code"] for row in rows if "error" in row]
-    code = 0 if not codes else codes[0] if len(rows) == 1 else PARTLY_FAILED
-    return facts, describe(facts), code
+    return facts, describe(facts), console.batch_code([row.get("exit_code", 0) for row in rows])
 
 
 # ── one capture ────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -245,14 +242,13 @@ def _work_folder(out: Path | None, stack: ExitStack) -> Path:
 
 def _tools(command: str | None) -> dict[str, Any]:
     """Versions of the tools used; raises SettingsError if one is missing."""
-    try:
-        used = {"virest": __version__, "evo": version("evo")}
-    except PackageNotFoundError:
-        raise SettingsError("evo is needed to score trajectories", hint="pip install 'virest[slam]'") from None
+    used = {"virest": __version__, "evo": installed_version("evo")}
+    if used["evo"] is None:
+        raise SettingsError("evo is needed to score trajectories", hint="pip install 'virest[slam]'")
     if command is not None:
         return {"versions": used, "tracker": command}
     require_pycolmap()
-    return {"versions": used | {"pycolmap": version("pycolmap")}, "tracker": "pycolmap"}
+    return {"versions": used | {"pycolmap": installed_version("pycolmap")}, "tracker": "pycolmap"}
 
 
 def _sfm_facts(options: SlamOptions) -> dict[str, Any] | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest import __version__
+from virest.app.machine import installed_version
 from virest.app.outputs import write_whole
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
@@ -122,11 +122,8 @@ def _truth_path(folder: Path, number: int) -> Path:
 
 def peer_versions() -> str:
     """Versions of virest, OpenCV and the peer library."""
-    try:
-        peer = f"scikit-image {version('scikit-image')}"
-    except PackageNotFoundError:
-        peer = "scikit-image not installed"
-    return f"virest {__version__}, OpenCV {cv2.__version__}, {peer}"
+    peer = installed_version("scikit-image") or "not installed"
+    return f"virest {__version__}, OpenCV {cv2.__version__}, scikit-image {peer}"
 
 
 def write_png(path: Path, picture: Picture) -> None:

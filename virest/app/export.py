@@ -12,7 +12,6 @@ the reference of a restored frame.  For tools without such a shift (ORB-SLAM3), 
 
 from __future__ import annotations
 
-import json
 import logging
 import secrets
 import shutil
@@ -36,7 +35,7 @@ from virest.app.export_plan import (
     plan_export,
 )
 from virest.app.export_scenes import colmap_files, frame_poses, gyroflow_profile, transforms_json
-from virest.app.outputs import output_error, plain, write_picture
+from virest.app.outputs import json_text, output_error, write_picture
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu
 from virest.camera.orb_slam import format_orb_slam
 from virest.camera.profile_file import format_profile
@@ -80,7 +79,7 @@ def run_export(plan: ExportPlan, progress: Callable[[int], Any] | None = None) -
         else:
             _write_tables(plan, written, part)
         facts = _facts(plan, written)
-        _write(part / RECORD, json.dumps(plain(facts), allow_nan=False, indent=2) + "\n")
+        _write(part / RECORD, json_text(facts))
     return facts, describe(facts)
 
 
@@ -94,7 +93,7 @@ def _write_lens_profile(plan: ExportPlan, part: Path) -> tuple[Json, str]:
     text, error_px = gyroflow_profile(replace(plan.profile, intrinsics=plan.standard.intrinsics), rate_hz)
     _write(part / "lens.json", text)
     facts = _facts(plan, list(plan.frames)) | {"frames": 0, "lens_error_px": error_px}
-    _write(part / RECORD, json.dumps(plain(facts), allow_nan=False, indent=2) + "\n")
+    _write(part / RECORD, json_text(facts))
     readout = f"{1e3 * plan.profile.shutter.readout_time_s:.2f} ms" if plan.profile.readout_known else "unknown"
     lines = [
         f"{plan.capture.name}: lens profile for Gyroflow, readout {readout}",

@@ -9,7 +9,6 @@ in a camera profile.  nerfstudio's camera axes are OpenGL's: x right, y up, z ba
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from virest.app.export_plan import ExportFrame, ExportPlan
-from virest.app.outputs import plain
+from virest.app.outputs import json_text
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
@@ -153,7 +152,7 @@ def transforms_json(plan: ExportPlan, poses: list[FramePose]) -> str:
         **_nerfstudio_distortion(lens),
         "frames": [_nerfstudio_frame(plan, pose) for pose in poses],
     }
-    return json.dumps(plain(content), allow_nan=False, indent=1) + "\n"
+    return json_text(content, indent=1)
 
 
 def _nerfstudio_distortion(lens: Intrinsics) -> Json:
@@ -247,7 +246,7 @@ def _shutter_json(plan: ExportPlan, poses: list[FramePose]) -> str:
         "readout_time_s": plan.profile.shutter.readout_time_s,
         "frames": frames,
     }
-    return json.dumps(plain(facts), allow_nan=False, indent=1) + "\n"
+    return json_text(facts, indent=1)
 
 
 # ── Gyroflow ─────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -289,7 +288,7 @@ def gyroflow_profile(profile: CameraProfile, fps: float) -> tuple[str, float]:
         "identifier": "",
         "calibrator_version": "virest",
     }
-    return json.dumps(plain(content), allow_nan=False, indent=2) + "\n", error_px
+    return json_text(content), error_px
 
 
 _DIRECTIONS = {

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from virest.app import console
-from virest.app.account import PARTLY_FAILED, STATUSES
+from virest.app.account import STATUSES
+from virest.errors import PARTLY_FAILED
 
 NUMBERS = (*STATUSES, "frames/s")
 WIDTH, MOST_VERDICT = 80, 21

@@ -107,6 +107,11 @@ def json_line(value: dict[str, Any]) -> str:
     return json.dumps(plain(value), allow_nan=False)
 
 
+def json_text(value: dict[str, Any], indent: int = 2) -> str:
+    """One record as the text of a JSON file."""
+    return json.dumps(plain(value), allow_nan=False, indent=indent) + "\n"
+
+
 def file_facts(path: Path) -> dict[str, Any]:
     """Name, size and sha256 of an input file."""
     with path.open("rb") as file:

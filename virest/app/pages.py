@@ -35,8 +35,7 @@ from pathlib import Path
 
 from virest import __version__
 from virest.app import console
-from virest.app.cli.options import cores
-from virest.app.doctor import processor
+from virest.app.machine import cores, processor
 from virest.app.outputs import write_whole
 from virest.errors import SettingsError, VirestError
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from virest.app import console
-from virest.app.account import PARTLY_FAILED, failure_account, run_account, run_totals
+from virest.app.account import failure_account, run_account, run_totals
 from virest.app.cluster import is_lost
 from virest.app.finish import Finished, finish_pictures, require_finishable
 from virest.app.jobs import PrefetchedCalls, Workers, run_segments
@@ -107,8 +107,7 @@ def process_captures(paths: list[str], options: ProcessOptions, shard: tuple[int
         workers.kill()
     if outcomes and not options.json_lines and not options.quiet:
         console.emit(summary(outcomes))
-    failures = [code for code in codes if code]
-    return 0 if not failures else failures[0] if len(codes) == 1 else PARTLY_FAILED
+    return console.batch_code(codes)
 
 
 def _require_config(config: Path) -> None:

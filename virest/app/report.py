@@ -36,7 +36,7 @@ from virest.app.report_files import (
 from virest.app.run_folder import RunFolder
 from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.video import MovieIndex, probe_movie, read_frames
-from virest.errors import CaptureError, OutputError, VirestError
+from virest.errors import PARTLY_FAILED, CaptureError, OutputError, VirestError
 from virest.report.html import (
     CaptureRecord,
     DiagnosisRecord,
@@ -62,7 +62,6 @@ FRAMES_SHOWN, MOST_FRAMES = 6, 24
 PICTURE_BYTES = 4_200_000
 """All frames of a page together, base64 encoded; with the figures, a page stays below about 6 MB."""
 MAX_PROFILE_BYTES, MAX_PICTURE_BYTES = 1 << 20, 256 << 20
-PARTLY_FAILED = 9
 ONLY_AFTER = "recorded frames are not shown"
 
 Json = dict[str, Any]

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from virest.app.outputs import json_line, output_error, plain, write_whole
+from virest.app.outputs import json_line, json_text, output_error, write_whole
 from virest.capture.location import is_remote, read_each, remove_files
 from virest.errors import OutputError
 
@@ -280,7 +280,7 @@ def _make_ready(run: RunFolder, request: dict[str, Any], mode: Mode) -> None:
         if mode == "overwrite":
             _remove_segments(run)
         if mode == "overwrite" or not run.state.exists():
-            write_whole(run.state, json.dumps(plain(request), allow_nan=False, indent=1).encode())
+            write_whole(run.state, json_text(request).encode())
         run.frames.mkdir(exist_ok=True)
         run.segments.mkdir(exist_ok=True)
         if mode == "overwrite":
@@ -429,7 +429,7 @@ def write_failure(run: RunFolder, account: dict[str, Any]) -> bool:
 
 
 def _write_account(run: RunFolder, account: dict[str, Any]) -> None:
-    write_whole(run.run_json, (json.dumps(plain(account), allow_nan=False, indent=2) + "\n").encode())
+    write_whole(run.run_json, json_text(account).encode())
 
 
 def _join(path: Path, logs: Iterable[Path]) -> None:

@@ -14,9 +14,8 @@ from typing import Any, TypeVar
 
 import cv2
 
-from virest.app.memory import keep_freed_memory
+from virest.app.machine import keep_freed_memory, one_thread_each
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 Result = TypeVar("Result")
 _prepared: list[int] = []
 
@@ -31,8 +30,7 @@ def prepare_worker() -> None:
 
 def process_pool(jobs: int, *, verbose: bool = False) -> ProcessPoolExecutor:
     """Worker processes, started on first use."""
-    for variable in THREAD_VARIABLES:
-        os.environ[variable] = "1"
+    one_thread_each()
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(jobs, context, initializer=_start_worker, initargs=(verbose,))
 

@@ -18,7 +18,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,8 @@ from virest.app.bench.speed import speed_section
 from virest.app.bench.summary import summary_text
 from virest.app.bench.workload import PRESETS, Scale
 from virest.app.console import emit
-from virest.app.doctor import processor
+from virest.app.machine import cores, installed_version, processor
+from virest.app.outputs import write_whole
 
 Section = Callable[[Path, Scale], tuple[dict[str, Any], str]]
 SECTIONS: dict[str, Section] = {
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for number, name in enumerate(options.only or SECTIONS):
             report[name], text = SECTIONS[name](work, scale)
             emit("\n" * bool(number) + text)
-            _write(options.out / "bench.json", report)
+            write_whole(options.out / "bench.json", (json.dumps(report, indent=1) + "\n").encode())
         if closing := summary_text(report):
             emit("\n" + closing)
     finally:
@@ -125,17 +125,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _versions() -> dict[str, Any]:
-    libraries = {name: _version(name) for name in LIBRARIES}
-    machine = {"machine": platform.machine(), "processor": processor(), "cores": len(os.sched_getaffinity(0))}
+    libraries = {name: installed_version(name) for name in LIBRARIES}
+    machine = {"machine": platform.machine(), "processor": processor(), "cores": cores()}
     program = {"virest": __version__, "commit": _commit(), "python": platform.python_version()}
     return {**program, **libraries, **machine, "load": os.getloadavg()[0]}
-
-
-def _version(library: str) -> str | None:
-    try:
-        return version(library)
-    except PackageNotFoundError:
-        return None
 
 
 def _commit() -> str | None:
@@ -145,12 +138,6 @@ def _commit() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def _write(path: Path, report: dict[str, Any]) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    os.replace(part, path)
 
 
 if __name__ == "__main__":

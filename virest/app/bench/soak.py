@@ -21,12 +21,12 @@ import numpy as np
 from virest.app.bench.memory import resident_bytes, run_sampled
 from virest.app.bench.workload import Scale, simulated
 from virest.app.console import numeric_table
+from virest.errors import PARTLY_FAILED
 
 CAPTURES, QUICK_CAPTURES = 200, 20
 BROKEN_EVERY = 10
 FRAMES = 8
 SAMPLE_S = 0.25
-PARTLY_FAILED = 9
 HEAD_LINES = 1
 SHIFT_NS = 10**15
 

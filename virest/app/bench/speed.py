@@ -26,7 +26,7 @@ from virest.app.bench.peers import (
 )
 from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recorded_frames, run_process
 from virest.app.console import cell, numeric_table
-from virest.app.doctor import processor
+from virest.app.machine import processor
 from virest.app.worker_processes import prepare_worker
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import probe_movie, read_gray

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from virest.app import console
-from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, cores, emit_facts, one_thread_each
+from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts
+from virest.app.machine import cores, one_thread_each
 
 CALIBRATED_EXTRAS = (
     "focal",

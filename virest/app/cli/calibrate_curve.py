@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from virest.app import console
-from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_of, one_thread_each
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_of
+from virest.app.machine import one_thread_each
 
 CURVE_KINDS = ("auto", "linear", "five_segment", "gamma", "srgb", "table")
 

@@ -18,9 +18,9 @@ from virest.app.cli.options import (
     emit_facts,
     on_bar,
     one_of,
-    one_thread_each,
     parse_frames,
 )
+from virest.app.machine import one_thread_each
 
 BOARDS = ("auto", "chessboard", "aprilgrid")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from virest.app import console
-from virest.app.cli.options import Captures, Json, Quiet, Verbose, Version, batch_code, capture_paths
+from virest.app.cli.options import Captures, Json, Quiet, Verbose, Version, capture_paths
 from virest.errors import VirestError
 
 
@@ -46,7 +46,7 @@ def inspect(
         except VirestError as error:
             code = console.report_error(error)
         codes.append(code)
-    return batch_code(codes)
+    return console.batch_code(codes)
 
 
 def _first_error(facts: dict[str, Any]) -> str:

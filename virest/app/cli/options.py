@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,6 @@ from virest.app import console
 
 log = logging.getLogger(__name__)
 
-PARTLY_FAILED = 9
 MOST_NEIGHBOURS = 8
 """Frames on each side: farther away even a capture at 30 frames/s shows a different scene."""
 
@@ -116,12 +114,6 @@ def parse_shard(text: str | None) -> tuple[int, int]:
     return part, parts
 
 
-def batch_code(codes: list[int]) -> int:
-    """The capture's own code for one capture; PARTLY_FAILED for a batch with any failure."""
-    failures = [code for code in codes if code]
-    return 0 if not failures else failures[0] if len(codes) == 1 else PARTLY_FAILED
-
-
 def emit_facts(facts: dict[str, Any], text: str, *, as_json: bool, quiet: bool = False) -> None:
     """Print a command's result: as text (not with ``quiet``), or as one JSON object."""
     from virest.app.outputs import json_line
@@ -143,14 +135,3 @@ def on_bar(bar: Any) -> Callable[[str, float], None] | None:
 
     bar.unit = "%"
     return show
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def one_thread_each() -> None:
-    """Limit linear algebra to one thread per process: sums do not depend on the machine, threads never exceed cores."""
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = "1"

@@ -19,13 +19,12 @@ from virest.app.cli.options import (
     Verbose,
     Version,
     capture_paths,
-    cores,
     one_of,
-    one_thread_each,
     parse_frames,
     parse_neighbours,
     parse_shard,
 )
+from virest.app.machine import cores, one_thread_each
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS
 
 

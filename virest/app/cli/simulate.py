@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from virest.app import console
-from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_of, one_thread_each, parse_frames
+from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_of, parse_frames
 from virest.app.cli.phone_options import (
     BitsPerPx,
     Denoise,
@@ -26,6 +26,7 @@ from virest.app.cli.phone_options import (
     Tone,
     one_or_two,
 )
+from virest.app.machine import one_thread_each
 from virest.restoration.settings import REFERENCES
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")

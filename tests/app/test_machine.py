@@ -5,14 +5,14 @@ import sys
 
 import pytest
 
-from virest.app.memory import keep_freed_memory
+from virest.app.machine import keep_freed_memory
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's mallopt")
 
 PROGRAM = """
 import resource
 import numpy as np
-from virest.app.memory import keep_freed_memory
+from virest.app.machine import keep_freed_memory
 {keep}
 def fill():
     for _ in range(20):
