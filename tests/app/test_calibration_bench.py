@@ -9,12 +9,9 @@ import pytest
 
 from virest.app.bench import calibration
 from virest.app.bench.workload import Scale
-from virest.app.calibrate import plan_calibration
 from virest.app.simulate import simulate_command
-from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
+from virest.calibration.geometry import GeometryCalibration
 from virest.camera.profile_file import read_profile
-from virest.capture.video import GrayReader, probe_movie
-from virest.inference.guide_choice import track_guided
 
 
 def _row(ratio: float, shared: float = 0.5) -> dict[str, object]:
@@ -68,10 +65,7 @@ def wrong_lens(tmp_path_factory: pytest.TempPathFactory) -> tuple[GeometryCalibr
         folder, width=320, height=240, frames=45, exposure_ms=8, noise_levels=1.0, bitrate_bits_per_px=1.0, seed=21,
         effects=hidden, truth_frames=False,
     )  # fmt: skip
-    plan = plan_calibration(folder, None, ("focal", "distortion"))
-    movie = plan.capture.movie
-    pairs = track_guided(plan.capture, plan.profile, GrayReader(movie, probe_movie(movie)), plan.frames)
-    return calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra), folder
+    return calibration.calibrate_folder(folder, ("focal", "distortion")), folder
 
 
 @pytest.mark.scenario

@@ -22,7 +22,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import read_any_profile
 from virest.capture.records import Capture as CaptureRecord
 from virest.capture.records import Note
-from virest.capture.video import MovieIndex, probe_movie, read_frames, read_gray
+from virest.capture.video import MovieIndex, probe_movie, read_frames
 from virest.errors import CaptureError, SettingsError
 from virest.image_formation.row_motion import FrameTranslation, row_motion
 from virest.motion.integration import integrate_gyro
@@ -113,18 +113,11 @@ class Capture:
 
     def plan(self, preset: str = "balanced", **settings: Any) -> RestorationPlan:
         """The plan for restoring this capture: the completed profile, translations, warnings."""
-        from virest.restoration.capture_estimation import plan_restoration
+        from virest.app.planning import estimate_plan
 
         composed = _settings(preset, settings)
         if composed not in self._plans:
-            steps: dict[int, float] = {}
-
-            def gray(numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-                for number, picture in read_gray(self.record.movie, self._movie(), numbers, steps):
-                    if picture is not None:
-                        yield number, picture
-
-            self._plans[composed] = plan_restoration(self.record, self.profile, composed, gray, steps)
+            self._plans[composed] = estimate_plan(self.record, self._movie(), self.profile, composed)
         return self._plans[composed]
 
     def _movie(self) -> MovieIndex:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from virest.app.console import cell, numeric_table
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, write_png
+from virest.capture.video import read_decodable_gray
 from virest.errors import CaptureError
 from virest.evaluation.angles import Rectangle, largest_rectangle, neighbour_angles_rad, quadrilateral_angles_rad
 from virest.evaluation.board_scenes import BoardSetting, board_session
@@ -188,7 +189,7 @@ def _by_constant_velocity(capture: TrueCapture) -> Callable[[int, Picture], Pict
         for f in capture.capture.frames
     }
     near = {f.index + step for f in capture.frames for step in (-1, 0, 1)} & set(middle_s)
-    pairs = track_pairs(capture.luma(sorted(near)))
+    pairs = track_pairs(read_decodable_gray(capture.capture.movie, capture.index, sorted(near)))
 
     def straighten(number: int, picture: Picture) -> Picture | None:
         velocity = fit_velocity(pairs, number, middle_s, shutter_, width, height)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,15 @@ from numpy.typing import NDArray
 from virest import __version__
 from virest.app.machine import installed_version
 from virest.app.outputs import write_whole
+from virest.app.planning import estimate_plan
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
-from virest.capture.video import MovieIndex, probe_movie, read_frames, read_gray
+from virest.capture.video import MovieIndex, probe_movie, read_frames
 from virest.errors import CaptureError, OutputError
 from virest.image_formation.row_motion import RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
-from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import RestorationSettings
 
@@ -61,9 +60,7 @@ class TrueCapture:
 
     def plan(self, settings: RestorationSettings, **profile: Any) -> RestorationPlan:
         """The plan of ``virest process``, with some profile values changed."""
-        steps: dict[int, float] = {}
-        read = partial(self.luma, steps=steps)
-        return plan_restoration(self.capture, replace(self.profile, **profile), settings, read, steps)
+        return estimate_plan(self.capture, self.index, replace(self.profile, **profile), settings)
 
     def restored(self, plan: RestorationPlan) -> Iterator[RestoredFrame]:
         """The evaluated frames as ``virest process`` restores them."""
@@ -83,12 +80,6 @@ class TrueCapture:
     def trajectory(self, plan: RestorationPlan) -> Trajectory:
         """The orientations integrated from the inertial log with the plan's profile."""
         return integrate_gyro(self.capture.imu, plan.profile)
-
-    def luma(self, numbers: Sequence[int], steps: dict[int, float] | None = None) -> Iterator[tuple[int, Picture]]:
-        """Luma of the requested frames that can be decoded; steps: filled with the encoder's quantiser steps."""
-        for number, picture in read_gray(self.capture.movie, self.index, numbers, steps):
-            if picture is not None:
-                yield number, picture
 
 
 def open_true_capture(folder: Path, config: Path | None = None, chosen: slice = slice(None)) -> TrueCapture:

@@ -10,11 +10,9 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app.finish import FinishOptions
@@ -28,7 +26,7 @@ from virest.camera.profile_file import profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile, unpack_hint
 from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
-from virest.capture.video import MovieIndex, probe_movie, read_gray
+from virest.capture.video import MovieIndex, probe_movie, read_decodable_gray
 from virest.errors import CaptureError, VirestError
 from virest.inference.recorder_stall import at_shown_times, fit_stall, stall_window
 from virest.report.words import with_deviation
@@ -262,16 +260,18 @@ def _input_files(capture: Capture, config: Path | None) -> Iterator[Path]:
         yield own
 
 
+def estimate_plan(
+    capture: Capture, index: MovieIndex, profile: CameraProfile, settings: RestorationSettings
+) -> RestorationPlan:
+    """The plan for restoring a capture, with the values estimated from its movie that the profile does not know."""
+    steps: dict[int, float] = {}
+    read = partial(read_decodable_gray, capture.movie, index, steps=steps)
+    return plan_restoration(capture, profile, settings, read, steps)
+
+
 def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> RestorationPlan:
     """Estimate unknown profile values and log the results."""
-    steps: dict[int, float] = {}
-
-    def read_decodable(numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        for number, picture in read_gray(job.capture.movie, index, numbers, steps):
-            if picture is not None:
-                yield number, picture
-
-    plan = plan_restoration(job.capture, job.profile, settings, read_decodable, steps)
+    plan = estimate_plan(job.capture, index, job.profile, settings)
     for name, estimate in plan.profile.estimates.items():
         logged = name == "time_offset_s" and any(note.code is NoteCode.TIME_OFFSET for note in plan.said)
         if name not in job.profile.estimates and not logged:
@@ -297,8 +297,8 @@ def _with_stalls_followed(job: Job, index: MovieIndex, plan: RestorationPlan) ->
     if plan.copy_reason is not None:
         return job, plan
     for stall in capture.stalls[:MOST_STALLS]:
-        pictures = read_gray(capture.movie, index, stall_window(capture, stall))
-        fit = fit_stall(capture, plan.profile, stall, {n: p for n, p in pictures if p is not None})
+        pictures = read_decodable_gray(capture.movie, index, stall_window(capture, stall))
+        fit = fit_stall(capture, plan.profile, stall, dict(pictures))
         if fit is None:
             log.info("%s: the true times of frames %d-%d could not be determined from points", job.name, *stall)
             continue

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.pictures import is_picture_source, read_picture_list
 from virest.capture.records import Capture, Frame
-from virest.capture.video import probe_movie, read_frames, read_gray
+from virest.capture.video import probe_movie, read_decodable_gray, read_frames
 from virest.errors import CaptureError, OutputError, SettingsError, VirestError
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import vector_from_rotation
@@ -104,14 +105,8 @@ def scene_plan(
     capture: Capture, profile: CameraProfile, settings: RestorationSettings = PRESETS["balanced"]
 ) -> RestorationPlan:
     """The capture's restoration plan, unknown values estimated. Raises SettingsError without a focal length."""
-    index = probe_movie(capture.movie)
-
-    def read_decodable(numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-        for number, picture in read_gray(capture.movie, index, numbers):
-            if picture is not None:
-                yield number, picture
-
-    plan = plan_restoration(capture, profile, settings, read_decodable)
+    read = partial(read_decodable_gray, capture.movie, probe_movie(capture.movie))
+    plan = plan_restoration(capture, profile, settings, read)
     if plan.profile.intrinsics is None:
         raise SettingsError(
             f"{capture.name}: {plan.copy_reason or 'focal length unknown'}", hint="--config takes a camera profile"

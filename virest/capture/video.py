@@ -191,12 +191,24 @@ def read_gray(
     yield from _read(path, index, frames, to_gray, steps)
 
 
+def read_decodable_gray(
+    path: Path, index: MovieIndex, frames: Iterable[int], steps: dict[int, float] | None = None
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """As :func:`read_gray`, without the frames that cannot be decoded."""
+    return ((number, picture) for number, picture in read_gray(path, index, frames, steps) if picture is not None)
+
+
 @dataclass(frozen=True, slots=True)
 class GrayReader:
     """Reads the luma of requested frames; plain data that a worker process can use by itself."""
 
     movie: Path
     index: MovieIndex
+
+    @classmethod
+    def of(cls, movie: Path) -> GrayReader:
+        """A reader of this movie."""
+        return cls(movie, probe_movie(movie))
 
     def __call__(self, frames: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
         """As `read_gray`."""

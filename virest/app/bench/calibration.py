@@ -28,7 +28,7 @@ from virest.calibration.calibrated_values import CalibratedValue
 from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import read_profile
-from virest.capture.video import GrayReader, probe_movie
+from virest.capture.video import GrayReader
 from virest.errors import VirestError
 from virest.inference.guide_choice import track_guided
 from virest.inference.tracking_bias import STILL_SHARED, STILL_SHARED_OTHER, shared_std
@@ -94,10 +94,7 @@ def calibrated_rows(work: Path, seed: int) -> list[Row]:
     folder = work / f"calibration_{seed}"
     simulate_command(folder, frames=FRAMES, seed=seed, effects=hidden, **taken)
     try:
-        plan = plan_calibration(folder, None, extra)
-        movie = plan.capture.movie
-        pairs = track_guided(plan.capture, plan.profile, GrayReader(movie, probe_movie(movie)), plan.frames)
-        found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra)
+        found = calibrate_folder(folder, extra)
     except VirestError:
         return []
     else:
@@ -105,6 +102,13 @@ def calibrated_rows(work: Path, seed: int) -> list[Row]:
         return [{"seed": seed, **taken, "noise_px": found.noise_px, **row} for row in errors_of(found, truth)]
     finally:
         shutil.rmtree(folder)
+
+
+def calibrate_folder(folder: Path, extra: Sequence[str] = ()) -> GeometryCalibration:
+    """Calibrate a capture as ``virest calibrate --with EXTRA`` does, without writing a profile."""
+    plan = plan_calibration(folder, None, extra)
+    pairs = track_guided(plan.capture, plan.profile, GrayReader.of(plan.capture.movie), plan.frames)
+    return calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra)
 
 
 def errors_of(found: GeometryCalibration, truth: CameraProfile) -> list[Row]:

@@ -21,7 +21,7 @@ from virest.app.bench.workload import Scale, simulated
 from virest.app.console import numeric_table
 from virest.app.diagnose import open_source
 from virest.camera.shutter import READOUT_DIRECTIONS
-from virest.capture.video import GrayReader, probe_movie
+from virest.capture.video import GrayReader
 from virest.image_formation.point_model import TrackTable, integrate_motion, predict
 from virest.inference.coded_motion import AT_ONCE_PER_PX, BY_ROWS_PER_PX, drawn_px, step_slopes
 from virest.inference.guide_choice import track_guided
@@ -55,7 +55,7 @@ def _row(work: Path, scene: tuple[int, str], read: str, bits_per_px: float) -> R
     )  # fmt: skip
     source = open_source(folder)
     capture, profile = source.capture, source.profile
-    pairs = track_guided(capture, profile, GrayReader(capture.movie, probe_movie(capture.movie)), range(FRAMES))
+    pairs = track_guided(capture, profile, GrayReader.of(capture.movie), range(FRAMES))
     seen = observe_tracks(capture, pairs, profile).table(MOST_POINTS)
 
     def fitted(term: Term, points: TrackTable) -> Array:

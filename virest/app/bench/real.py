@@ -8,16 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from virest.app.bench.calibration import calibrate_folder
 from virest.app.bench.workload import Scale, real_captures, run_process
-from virest.app.calibrate import plan_calibration
 from virest.app.console import numeric_table
 from virest.app.diagnose import climb_as_command, open_source
-from virest.calibration.geometry import calibrate_geometry
-from virest.capture.video import GrayReader, probe_movie
 from virest.diagnosis.findings import Diagnosis
 from virest.diagnosis.geometric_findings import shown
 from virest.errors import VirestError
-from virest.inference.guide_choice import track_guided
 
 log = logging.getLogger(__name__)
 
@@ -59,10 +56,7 @@ def _processed(folder: Path, work: Path) -> Row:
 
 def _calibrated(folder: Path, extra: tuple[str, ...]) -> list[Row]:
     try:
-        plan = plan_calibration(folder, None, extra)
-        movie = plan.capture.movie
-        pairs = track_guided(plan.capture, plan.profile, GrayReader(movie, probe_movie(movie)), plan.frames)
-        found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra)
+        found = calibrate_folder(folder, extra)
     except VirestError as error:
         log.info("%s", error)
         return [[folder.name, "refused", "", "", ""]]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,11 @@ from virest.app.bench.peers import (
 from virest.app.bench.workload import PRESETS, Run, Scale, looped_capture, recorded_frames, run_process
 from virest.app.console import cell, numeric_table
 from virest.app.machine import processor
+from virest.app.planning import estimate_plan
 from virest.app.worker_processes import prepare_worker
 from virest.capture.folder import read_capture, resolve_profile
-from virest.capture.video import probe_movie, read_gray
+from virest.capture.video import probe_movie
 from virest.image_formation import transforms
-from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.settings import PRESETS as SETTINGS
 
 FLOOR = "floor"
@@ -169,14 +169,8 @@ def _planning_cpu_s(folder: Path) -> float:
     capture = read_capture(folder)
     profile, _ = resolve_profile(capture, None)
     index = probe_movie(capture.movie)
-
-    steps: dict[int, float] = {}
-
-    def read(numbers: Any) -> Iterator[tuple[int, Any]]:
-        return ((n, picture) for n, picture in read_gray(capture.movie, index, numbers, steps) if picture is not None)
-
     began = time.process_time()
-    plan_restoration(capture, profile, SETTINGS["fast"], read, steps)
+    estimate_plan(capture, index, profile, SETTINGS["fast"])
     return time.process_time() - began
 
 
