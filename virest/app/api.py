@@ -89,26 +89,21 @@ class Capture:
         number = self._number(index)
         for _, picture in self.read_frames(number, number + 1):
             return picture
-        raise CaptureError(
-            f"{self.name}: frame {number} cannot be decoded", hint="virest inspect shows what is wrong with it"
-        )
+        raise self._undecodable(number)
 
     def restore(self, index: int, preset: str = "balanced", **settings: Any) -> RestoredFrame:
         """Restore one frame as ``virest process`` does; unknown profile values and translation are estimated once."""
+        from virest.app.planning import read_with_neighbours
+
         number = self._number(index)
         plan = self.plan(preset, **settings)
         frame = self.frames[number]
         if frame.skip_reason is not None:
             return RestoredFrame(frame, "skipped", None, (frame.skip_reason,))
-        around = range(max(number - plan.reach, 0), min(number + plan.reach + 1, len(self)))
         steps: dict[int, float] = {}
-        read = read_frames(self.record.movie, self._movie(), around[0], around[-1], steps)
-        decoded = {n: picture for n, picture in read if picture is not None}
-        if number not in decoded:
-            raise CaptureError(
-                f"{self.name}: frame {number} cannot be decoded", hint="virest inspect shows what is wrong with it"
-            )
-        near = [(self.frames[k], decoded[k]) for k in sorted(decoded) if k == number or not self.frames[k].skip_reason]
+        near = read_with_neighbours(self.record.movie, self._movie(), self.frames, number, plan.reach, steps)
+        if near is None:
+            raise self._undecodable(number)
         return next(restore_frames(near, self.imu, plan, {number}, steps))
 
     def plan(self, preset: str = "balanced", **settings: Any) -> RestorationPlan:
@@ -119,6 +114,10 @@ class Capture:
         if composed not in self._plans:
             self._plans[composed] = estimate_plan(self.record, self._movie(), self.profile, composed)
         return self._plans[composed]
+
+    def _undecodable(self, number: int) -> CaptureError:
+        hint = "virest inspect shows what is wrong with it"
+        return CaptureError(f"{self.name}: frame {number} cannot be decoded", hint=hint)
 
     def _movie(self) -> MovieIndex:
         if self._index is None:

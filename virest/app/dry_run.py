@@ -13,10 +13,10 @@ import numpy as np
 from virest.app import console
 from virest.app.names import shard_of
 from virest.app.outputs import json_line
-from virest.app.planning import Job, Planned, ProcessOptions, plan_capture
+from virest.app.planning import Job, Planned, ProcessOptions, plan_capture, read_with_neighbours
 from virest.app.png import png_bytes
 from virest.capture.folder import Frame
-from virest.capture.video import MovieIndex, read_frames
+from virest.capture.video import MovieIndex
 from virest.errors import VirestError
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 
@@ -42,6 +42,19 @@ class Forecast:
     def facts(self) -> dict[str, Any]:
         """For ``--json``."""
         return {"capture": self.name, **{k: v for k, v in dataclasses.asdict(self).items() if k != "name"}}
+
+
+@dataclass(frozen=True, slots=True)
+class _Probe:
+    """What one frame cost and gained."""
+
+    seconds: float
+    """Time of restoring and encoding it."""
+    bytes: int
+    """Size of its PNG."""
+    blur_px: float | None
+    gain_db: float | None
+    """Predicted gain; None: deblurring is not expected to help."""
 
 
 def predict_captures(paths: list[str], options: ProcessOptions, shard: tuple[int, int] = (1, 1)) -> int:
@@ -73,20 +86,24 @@ def predict(path: str, name: str, options: ProcessOptions) -> Forecast:
     assert planned.plan is not None
     job = planned.job
     usable = [frame for frame in job.selected if frame.skip_reason is None]
-    probed = [_restored(job, planned.index, planned.plan, frame) for frame in _evenly_spaced(usable)]
-    known = [found for found in probed if found is not None]
-    per_frame_s = float(np.median([found[0] for found in known[1:] or known])) if known else 0.0
-    blur = [found[2] for found in known if found[2] is not None]
-    gain = [found[3] for found in known if found[3] is not None]
+    tried = (_probe(job, planned.index, planned.plan, frame) for frame in _evenly_spaced(usable))
+    probes = [probe for probe in tried if probe is not None]
+    per_frame_s = _median([probe.seconds for probe in probes[1:] or probes]) or 0.0
     return Forecast(
         name,
         len(usable),
         len(job.selected) - len(usable),
-        float(np.median(blur)) if blur else None,
-        float(np.median(gain)) if gain else None,
+        _median([probe.blur_px for probe in probes]),
+        _median([probe.gain_db for probe in probes]),
         planned.seconds + per_frame_s * len(usable) / options.jobs,
-        float(np.mean([found[1] for found in known])) * len(usable) if known else 0.0,
+        float(np.mean([probe.bytes for probe in probes])) * len(usable) if probes else 0.0,
     )
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    """Median of the known values; None if none is known."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
 def _evenly_spaced(frames: Sequence[Frame]) -> list[Frame]:
@@ -95,18 +112,14 @@ def _evenly_spaced(frames: Sequence[Frame]) -> list[Frame]:
     return [frames[k] for k in indices.tolist()]
 
 
-def _restored(
-    job: Job, index: MovieIndex, plan: RestorationPlan, frame: Frame
-) -> tuple[float, int, float | None, float | None] | None:
-    """Seconds, bytes of the PNG, blur in pixels and predicted gain of a frame; None if it cannot be restored."""
-    frames = {f.index: f for f in at_true_times(job.capture.frames, plan.profile, job.capture.repeats)}
-    first, last = max(frame.index - plan.reach, 0), min(frame.index + plan.reach, len(frames) - 1)
+def _probe(job: Job, index: MovieIndex, plan: RestorationPlan, frame: Frame) -> _Probe | None:
+    """Restore a frame in memory; None if that is not possible."""
+    frames = list(at_true_times(job.capture.frames, plan.profile, job.capture.repeats))
+    frames[frame.index] = frame  # selected, even if it belongs to the recorder's start-up
     steps: dict[int, float] = {}
-    decoded = {n: p for n, p in read_frames(job.capture.movie, index, first, last, steps) if p is not None}
-    if frame.index not in decoded:
+    near = read_with_neighbours(job.capture.movie, index, frames, frame.index, plan.reach, steps)
+    if near is None:
         return None
-    near = [(frames[n], decoded[n]) for n in sorted(decoded) if n != frame.index and not frames[n].skip_reason]
-    near = sorted([*near, (frame, decoded[frame.index])], key=lambda pair: pair[0].index)
     began = time.perf_counter()
     restored = next(restore_frames(near, job.capture.imu, plan, {frame.index}, steps), None)
     if restored is None or restored.picture is None or restored.degradation is None:
@@ -114,7 +127,7 @@ def _restored(
     size = len(png_bytes(restored.picture))
     seconds = time.perf_counter() - began
     found = restored.degradation
-    return seconds, size, found.blur.length_px, found.expected_gain_db
+    return _Probe(seconds, size, found.blur.length_px, found.expected_gain_db)
 
 
 def _table(forecasts: list[Forecast]) -> str:

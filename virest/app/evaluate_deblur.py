@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.console import numeric_table
-from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, read_picture, write_png
+from virest.app.difference_sheets import amplified_difference, labelled, write_sheet
+from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, read_picture, temporary_folder
 from virest.app.simulate import simulate_command
 from virest.camera.response import ResponseCurve
 from virest.errors import CaptureError
@@ -25,7 +24,6 @@ from virest.evaluation.baselines import BASELINES, baseline_pictures
 from virest.evaluation.burst import BURSTS, REACHES, align_frames
 from virest.evaluation.fidelity import (
     MARGIN_PX,
-    difference_map,
     fidelity,
     inner_part,
     mean_squared_error,
@@ -64,8 +62,6 @@ JUDGED_OVER_TIME = slice(4, 7)
 """Of the 11 frames: those with neighbours on both sides for every method."""
 SINGLE = "virest best, single"
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-MAP_GAIN = 2
-"""Gain of the difference maps."""
 SHEET_COLUMNS = 4
 
 
@@ -124,8 +120,7 @@ def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture]
         chosen = options.frames or slice(None)
         yield [open_true_capture(Path(path), options.config, chosen) for path in options.captures], []
         return
-    work = Path(tempfile.mkdtemp(prefix="virest-evaluate-"))
-    try:
+    with temporary_folder("virest-evaluate-") as work:
         standard, quick = (OVER_TIME, OVER_TIME_QUICK) if options.over_time else (STANDARD, QUICK)
         count, judged = {"frames": FRAMES_QUICK if options.quick else FRAMES}, slice(None)
         if options.over_time:
@@ -133,8 +128,6 @@ def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture]
         names = [(name, settings | count) for name, settings in standard if not options.quick or name in quick]
         simulated = [{**simulate_command(work / name, **settings), "capture": name} for name, settings in names]
         yield [open_true_capture(work / name, None, judged) for name, _ in names], simulated
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 # ── one capture ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -214,19 +207,14 @@ def _draw(
     if out is None:
         return
     inside = inner_part(valid_px)
-    shown = {"truth": truth, **pictures}
-    cells = [_column(method, picture[inside], truth[inside]) for method, picture in shown.items()]
+    shown = {method: picture[inside] for method, picture in {"truth": truth, **pictures}.items()}
+    cells = [
+        labelled(method, np.concatenate([picture, amplified_difference(picture, truth[inside])]))
+        for method, picture in shown.items()
+    ]
     cells += [np.full_like(cells[0], 255)] * (-len(cells) % SHEET_COLUMNS)
     rows = [np.concatenate(cells[k : k + SHEET_COLUMNS], axis=1) for k in range(0, len(cells), SHEET_COLUMNS)]
-    write_png(out / f"{name}-difference.png", np.concatenate(rows))
-
-
-def _column(name: str, picture: Picture, truth: Picture) -> Picture:
-    grey = cv2.convertScaleAbs(difference_map(picture, truth), alpha=MAP_GAIN)
-    both = np.concatenate([picture, np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), np.uint8)])
-    head = np.full((22, both.shape[1], 3), 255, np.uint8)
-    cv2.putText(head, name, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
-    return cv2.copyMakeBorder(np.concatenate([head, both]), 0, 0, 0, 4, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+    write_sheet(out / f"{name}-difference.png", np.concatenate(rows))
 
 
 # ── two folders ──────────────────────────────────────────────────────────────────────────────────────────────────

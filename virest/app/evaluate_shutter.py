@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -15,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.console import cell, numeric_table
-from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, write_png
+from virest.app.difference_sheets import amplified_difference, labelled, write_sheet
+from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, temporary_folder
 from virest.capture.video import read_decodable_gray
 from virest.errors import CaptureError
 from virest.evaluation.angles import Rectangle, largest_rectangle, neighbour_angles_rad, quadrilateral_angles_rad
 from virest.evaluation.board_scenes import BoardSetting, board_session
 from virest.evaluation.boards import Board, find_board, matched, plane_lattice
-from virest.evaluation.fidelity import difference_map, fidelity, psnr_of
+from virest.evaluation.fidelity import fidelity, psnr_of
 from virest.evaluation.schubert2018 import fit_velocity, velocity_map
 from virest.image_formation.row_clock import ROW_MIDDLE, RowClock
 from virest.inference.tracking import track_pairs
@@ -39,7 +38,6 @@ METHODS: dict[str, str] = {
     "rowwise-rotation": "every row at its own time, rotation only",
     "rowwise": "every row at its own time, with translation and depth if known: what virest process does",
 }
-OURS = "rowwise"
 BITS_PER_PX = 2.0
 """Bit rate of the standard set's movies, high because coding noise moves corners more than straightening does."""
 STANDARD = (
@@ -54,8 +52,6 @@ JUDGED, JUDGED_QUICK = 10, 4
 """Evenly spaced frames per capture of the standard set."""
 CROP_MARGIN_PX = 12
 """Around the board's corners, for the comparison of pictures."""
-MAP_GAIN = 2
-"""Gain of the difference maps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,11 +112,8 @@ def _chosen_captures(options: ShutterOptions) -> Iterator[list[TrueCapture]]:
             open_true_capture(Path(path), options.config, options.frames or slice(None)) for path in options.captures
         ]
         return
-    work = Path(tempfile.mkdtemp(prefix="virest-evaluate-"))
-    try:
+    with temporary_folder("virest-evaluate-") as work:
         yield [_simulated(work, setting, options.quick) for setting in _standard(options.quick)]
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _standard(quick: bool) -> list[BoardSetting]:
@@ -155,7 +148,7 @@ def _judge(capture: TrueCapture, options: ShutterOptions) -> Iterator[FrameResul
         if options.out and (worst is None or sheared > worst[0]):
             worst = sheared, {method: picture[crop] for method, picture in pictures.items()}, truth[crop]
     if worst is not None and options.out is not None:
-        write_png(options.out / f"{capture.name}-difference.png", difference_sheet(worst[1], worst[2]))
+        write_sheet(options.out / f"{capture.name}-difference.png", difference_sheet(worst[1], worst[2]))
 
 
 def _straightened(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture], tuple[int, int, int, int]]]:
@@ -252,18 +245,8 @@ def _grey(picture: Picture) -> Picture:
 
 def difference_sheet(pictures: Mapping[str, Picture], truth: Picture) -> Picture:
     """Truth and the difference maps of all methods side by side, each labelled; RGB."""
-    shown = {"truth": truth}
-    for method, picture in pictures.items():
-        grey = cv2.convertScaleAbs(difference_map(picture, truth), alpha=MAP_GAIN)
-        shown[method] = np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), np.uint8)
-    return np.concatenate([_titled(name, picture) for name, picture in shown.items()], axis=1)
-
-
-def _titled(name: str, picture: Picture) -> Picture:
-    head = np.full((22, picture.shape[1] + 4, 3), 255, np.uint8)
-    cv2.putText(head, name, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-    framed = cv2.copyMakeBorder(picture, 0, 4, 0, 4, cv2.BORDER_CONSTANT, value=(255, 255, 255))
-    return np.concatenate([head, framed])
+    shown = {"truth": truth} | {method: amplified_difference(picture, truth) for method, picture in pictures.items()}
+    return np.concatenate([labelled(name, picture) for name, picture in shown.items()], axis=1)
 
 
 # ── results ──────────────────────────────────────────────────────────────────────────────────────────────────────

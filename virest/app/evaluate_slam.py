@@ -7,8 +7,6 @@ aligned by a Sim(3) and scored by evo as ``evo_ape`` does; each run has its own 
 from __future__ import annotations
 
 import logging
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ import numpy as np
 
 from virest import __version__
 from virest.app import console
+from virest.app.evaluation_captures import temporary_folder
 from virest.app.machine import installed_version
 from virest.app.outputs import json_line
 from virest.app.slam_captures import (
@@ -231,9 +230,7 @@ def _tasks(captures: Sequence[Path], options: SlamOptions) -> list[_Task]:
 def _work_folder(out: Path | None, stack: ExitStack) -> Path:
     """Output folder; a temporary one, removed at the end, if none is given."""
     if out is None:
-        folder = Path(tempfile.mkdtemp(prefix="virest-slam-"))
-        stack.callback(shutil.rmtree, folder, ignore_errors=True)
-        return folder
+        return stack.enter_context(temporary_folder("virest-slam-"))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise OutputError(f"{out} exists and is not empty", hint="choose another folder for --out")
     out.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,18 +15,18 @@ from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app.machine import installed_version
-from virest.app.outputs import write_whole
 from virest.app.planning import estimate_plan
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
 from virest.capture.video import MovieIndex, probe_movie, read_frames
-from virest.errors import CaptureError, OutputError
+from virest.errors import CaptureError
 from virest.image_formation.row_motion import RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import RestorationSettings
+from virest.simulation.recording import truth_picture
 
 Picture = NDArray[np.uint8]
 
@@ -56,7 +58,7 @@ class TrueCapture:
 
     def truth(self, number: int) -> Picture:
         """The sharp picture of a frame, RGB."""
-        return read_picture(_truth_path(self.capture.folder, number))
+        return truth_frame(self.capture.folder, number)
 
     def plan(self, settings: RestorationSettings, **profile: Any) -> RestorationPlan:
         """The plan of ``virest process``, with some profile values changed."""
@@ -90,13 +92,25 @@ def open_true_capture(folder: Path, config: Path | None = None, chosen: slice = 
     numbers = sorted(range(len(frames))[chosen])
     usable = tuple(frame for frame in frames if frame.skip_reason is None)
     chosen_ones = {frames[k].index for k in numbers}
-    judged = tuple(f for f in usable if f.index in chosen_ones and _truth_path(folder, f.index).is_file())
+    judged = tuple(f for f in usable if f.index in chosen_ones and truth_picture(folder, f.index).is_file())
     if not judged:
         raise CaptureError(
             f"{folder}: none of {len(numbers)} selected frames has ground truth in {folder.name}/truth/frames",
             hint="virest simulate writes captures with ground truth",
         )
     return TrueCapture(capture.folder.resolve().name, capture, profile, probe_movie(capture.movie), judged, usable)
+
+
+@contextmanager
+def temporary_folder(prefix: str) -> Iterator[Path]:
+    """A folder for simulated captures, removed at the end, as far as possible."""
+    with tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
+
+
+def truth_frame(capture: Path, number: int) -> Picture:
+    """The sharp global-shutter picture of a frame, RGB."""
+    return read_picture(truth_picture(capture, number))
 
 
 def read_picture(path: Path) -> Picture:
@@ -107,23 +121,7 @@ def read_picture(path: Path) -> Picture:
     return picture[..., ::-1].astype(np.uint8)
 
 
-def _truth_path(folder: Path, number: int) -> Path:
-    return folder / "truth" / "frames" / f"{number:06d}.png"
-
-
 def peer_versions() -> str:
     """Versions of virest, OpenCV and the peer library."""
     peer = installed_version("scikit-image") or "not installed"
     return f"virest {__version__}, OpenCV {cv2.__version__}, scikit-image {peer}"
-
-
-def write_png(path: Path, picture: Picture) -> None:
-    """Write an RGB or grey picture atomically; its folder is created."""
-    done, coded = cv2.imencode(".png", picture if picture.ndim == 2 else picture[..., ::-1])
-    if not done:
-        raise OutputError(f"{path}: the picture cannot be encoded as PNG", hint="please report this")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, coded.tobytes())
-    except OSError as error:
-        raise OutputError(f"{path}: {error.strerror or error}", hint="check space and permissions") from error

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from virest.app import api
 from virest.app.console import emit
+from virest.app.evaluation_captures import truth_frame
 from virest.app.outputs import write_whole
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
@@ -107,11 +108,10 @@ def _page(work: Path) -> _Shot:
 def _shot(folder: Path, frame: int) -> _Shot:
     capture = api.open(folder)
     restored, single = (capture.restore(frame, "best", **alone).picture for alone in ({}, {"neighbours": 0}))
-    truth = cv2.imread(str(folder / "truth" / "frames" / f"{frame:06d}.png"))
-    if restored is None or single is None or truth is None:
+    if restored is None or single is None:
         raise RuntimeError(f"{folder}: frame {frame} was not restored")
-    sharp = np.ascontiguousarray(truth[..., ::-1])
-    return _Shot(capture.record, capture.profile, frame, capture.read_frame(frame), restored, single, sharp)
+    recorded, truth = capture.read_frame(frame), truth_frame(folder, frame)
+    return _Shot(capture.record, capture.profile, frame, recorded, restored, single, truth)
 
 
 def _before_after(shot: _Shot, side: int = 330, corner: tuple[int, int] = (600, 352)) -> bytes:

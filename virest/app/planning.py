@@ -14,6 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from virest import __version__
 from virest.app.finish import FinishOptions
 from virest.app.outputs import file_facts, plain
@@ -26,7 +29,7 @@ from virest.camera.profile_file import profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile, unpack_hint
 from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
-from virest.capture.video import MovieIndex, probe_movie, read_decodable_gray
+from virest.capture.video import MovieIndex, probe_movie, read_decodable_gray, read_frames
 from virest.errors import CaptureError, VirestError
 from virest.inference.recorder_stall import at_shown_times, fit_stall, stall_window
 from virest.report.words import with_deviation
@@ -267,6 +270,20 @@ def estimate_plan(
     steps: dict[int, float] = {}
     read = partial(read_decodable_gray, capture.movie, index, steps=steps)
     return plan_restoration(capture, profile, settings, read, steps)
+
+
+def read_with_neighbours(
+    movie: Path, index: MovieIndex, frames: Sequence[Frame], number: int, reach: int, steps: dict[int, float]
+) -> list[tuple[Frame, NDArray[np.uint8]]] | None:
+    """A frame and its usable neighbours up to ``reach`` away, in order, RGB; None if the frame cannot be decoded.
+
+    steps: filled with the encoder's quantiser steps.
+    """
+    first, last = max(number - reach, 0), min(number + reach, len(frames) - 1)
+    decoded = {n: picture for n, picture in read_frames(movie, index, first, last, steps) if picture is not None}
+    if number not in decoded:
+        return None
+    return [(frames[n], decoded[n]) for n in sorted(decoded) if n == number or frames[n].skip_reason is None]
 
 
 def _plan(job: Job, index: MovieIndex, settings: RestorationSettings) -> RestorationPlan:

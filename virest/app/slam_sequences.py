@@ -36,6 +36,7 @@ from virest.evaluation.trajectories import CameraPath, match_times, parse_tum, t
 from virest.image_formation.row_motion import frame_times_s
 from virest.restoration.capture import at_true_times
 from virest.restoration.settings import RestorationSettings
+from virest.simulation.recording import truth_picture
 
 Array = NDArray[np.float64]
 
@@ -91,7 +92,7 @@ def write_sequences(capture_path: Path, out: Path, settings: RestorationSettings
     finally:
         workers.kill()
     restored = {line["frame"]: run / line["output"] for line in read_lines(run / "parameters.jsonl") if line["output"]}
-    sharp = {k: file for k in restored if (file := capture_path / "truth" / "frames" / f"{k:06d}.png").is_file()}
+    sharp = {k: file for k in restored if (file := truth_picture(capture_path, k)).is_file()}
     kinds = KINDS if sharp else KINDS[1:]
     numbers = sorted(sharp or restored)
     if len(numbers) < LEAST_FRAMES:

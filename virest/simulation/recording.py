@@ -86,6 +86,11 @@ class RecordingOptions:
     """Write truth/frames."""
 
 
+def truth_picture(capture: Path, frame: int, kind: str = "frames") -> Path:
+    """Path of the truth of a frame; kind: ``frames`` (at the start of the first row) or ``frame_middle``."""
+    return capture / "truth" / kind / f"{frame:06d}.png"
+
+
 def write_recording(
     session: Session,
     out: Path,
@@ -206,12 +211,12 @@ def _fill_folder(
     write_profile(session.true, truth / "camera.yaml")
     _write_trajectory(truth, session)
     _write_effects(truth, session, applied)
-    pictures = _rendered(session, truth, options, progress)
+    pictures = _rendered(session, folder, options, progress)
     write_movie(folder / "movie.mp4", pictures, session.stamp_tick, session.settings.fps, options)
 
 
 def _rendered(
-    session: Session, truth: Path, options: RecordingOptions, progress: Callable[[int, int], None] | None
+    session: Session, folder: Path, options: RecordingOptions, progress: Callable[[int, int], None] | None
 ) -> Iterable[Picture]:
     """Yield each slot's frame and write its truth frames.  Repeated captures are not rendered again."""
     total = len(session.shows)
@@ -221,9 +226,9 @@ def _rendered(
         if picture is None or session.shows[slot] != session.shows[slot - 1]:
             picture = render_picture(session, slot, phone)
         if options.truth_frames:
-            _write_png(truth / "frames" / f"{slot:06d}.png", render_truth(session, slot))
+            _write_png(truth_picture(folder, slot), render_truth(session, slot))
         if options.middle_truth:
-            _write_png(truth / "frame_middle" / f"{slot:06d}.png", render_truth(session, slot, middle=True))
+            _write_png(truth_picture(folder, slot, "frame_middle"), render_truth(session, slot, middle=True))
         if progress:
             progress(slot + 1, total)
         yield picture

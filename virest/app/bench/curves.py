@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.bench.workload import Picture, Scale, recorded_frames, simulated, truth_frame
+from virest.app.bench.workload import Picture, Scale, recorded_frames, simulated
 from virest.app.console import cell, numeric_table
+from virest.app.evaluation_captures import truth_frame
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import read_capture, resolve_profile
 from virest.evaluation.fidelity import MARGIN_PX

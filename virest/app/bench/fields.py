@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.bench.workload import Scale, run_process, truth_frame
+from virest.app.bench.workload import Scale, run_process
 from virest.app.console import cell, numeric_table
 from virest.app.diagnose import Source, open_source
+from virest.app.evaluation_captures import truth_frame
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import write_profile
 from virest.camera.response import ResponseCurve

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.workload import Scale, Workload, honesty_workloads, run_process, simulated, truth_frame
+from virest.app.bench.workload import Scale, Workload, honesty_workloads, run_process, simulated
 from virest.app.console import cell, emit, numeric_table
+from virest.app.evaluation_captures import truth_frame
 from virest.evaluation.fidelity import psnr_db
 
 Row = dict[str, Any]

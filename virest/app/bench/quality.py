@@ -16,9 +16,9 @@ from virest.app.bench.workload import (
     recorded_frames,
     run_process,
     simulated,
-    truth_frame,
 )
 from virest.app.console import CONSOLE, cell, numeric_table
+from virest.app.evaluation_captures import truth_frame
 from virest.evaluation.fidelity import psnr_db
 
 METHODS = (*PRESETS, *PEERS)

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from virest.app.bench.workload import Scale, recorded_frames, run_process, simulated, truth_frame
+from virest.app.bench.workload import Scale, recorded_frames, run_process, simulated
 from virest.app.console import numeric_table
+from virest.app.evaluation_captures import truth_frame
 from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.evaluation.fidelity import point_distances_px
 

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.app.evaluation_captures import read_picture
 from virest.app.simulate import simulate_command
 from virest.capture.video import probe_movie, read_frames
 from virest.simulation.phone_isp import PhoneIsp
@@ -263,7 +263,7 @@ class Run:
 
     def picture(self, line: dict[str, Any]) -> Picture:
         """Read the restored frame of a line, RGB."""
-        return read_png(self.folder / line["output"])
+        return read_picture(self.folder / line["output"])
 
 
 def process_command(capture: Path, out: Path, *arguments: str) -> list[str]:
@@ -287,19 +287,6 @@ def recorded_frames(capture: Path) -> Iterator[tuple[int, Picture]]:
     for number, picture in read_frames(movie, index, 0, len(index) - 1):
         if picture is not None:
             yield number, picture
-
-
-def truth_frame(capture: Path, number: int, folder: str = "frames") -> Picture:
-    """Read the truth of a frame (sharp, global shutter), RGB."""
-    return read_png(capture / "truth" / folder / f"{number:06d}.png")
-
-
-def read_png(path: Path) -> Picture:
-    """Read an RGB picture."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise FileNotFoundError(path)
-    return picture[..., ::-1].astype(np.uint8)
 
 
 # ── long captures ────────────────────────────────────────────────────────────────────────────────────────────────
