@@ -22,6 +22,16 @@ PARTLY_FAILED = 9
 """Exit code of a batch of which a part failed, and of a capture some of whose frames failed."""
 
 
+def printable(text: str) -> str:
+    """A name or a value for a message: characters that cannot be printed are shown as ``?``."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def one_line(text: object, most: int = 200) -> str:
+    """A text, or what an error of another library says, in one line of at most this many characters."""
+    return " ".join(str(text).split())[:most]
+
+
 class VirestError(Exception):
     """What went wrong (message), what to do next (hint), and the numbers behind it (facts)."""
 

@@ -17,7 +17,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.detect import is_capture
 from virest.capture.folder import read_capture
 from virest.capture.stills import Still, capture_bracket, read_bracket
-from virest.errors import CaptureError, OutputError, SettingsError
+from virest.errors import CaptureError, OutputError, SettingsError, printable
 from virest.report.figures import FORMATS, response_figure
 
 log = logging.getLogger(__name__)
@@ -128,13 +128,9 @@ def format_curve(facts: dict[str, Any]) -> str:
     for p in facts["pictures"]:
         error = "left out" if p["exposure_error_ev"] is None else f"{round(p['exposure_error_ev'], 3) + 0.0:+.3f} EV"
         mark = f", contradicts the others; likely {p['likely_exposure_s']:.6g} s" if p["contradicts"] else ""
-        lines.append(f"# {_one_line(p['file'])}: {p['exposure_s']:.6g} s, error {error}{mark}")
+        lines.append(f"# {printable(p['file'])}: {p['exposure_s']:.6g} s, error {error}{mark}")
     block = yaml.safe_dump({"response": facts["response"]}, sort_keys=False, default_flow_style=None, width=110)
     return "\n".join(lines) + "\n" + block
-
-
-def _one_line(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def _shown(value: float | list[float]) -> str:
@@ -149,7 +145,7 @@ def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
         error = "–" if p["exposure_error_ev"] is None else f"{round(p['exposure_error_ev'], 3) + 0.0:+.3f}"
         likely = f"{p['likely_exposure_s']:.6g}" if p["contradicts"] else ""
         verdict = "yes" if p["contradicts"] else "no"
-        rows.append([_one_line(p["file"]), f"{p['exposure_s']:.6g}", error, verdict, likely])
+        rows.append([printable(p["file"]), f"{p['exposure_s']:.6g}", error, verdict, likely])
     low, high = facts["covered_exposure"]
     block = dict(facts["response"])
     name = block.pop("kind")
@@ -161,6 +157,6 @@ def describe(facts: dict[str, Any], out: Path | None, plot: Path | None) -> str:
         f"the curve is known to ± {facts['curve_std_grey_levels']:.2f} grey levels there",
         table(["picture", "exposure_s", "error_ev", "contradicts", "likely_s"], rows),
     ]
-    lines += [f"note: {_one_line(note)}" for note in facts["notes"]]
+    lines += [f"note: {printable(note)}" for note in facts["notes"]]
     lines += [f"wrote {path}" for path in (out, plot) if path]
     return "\n".join(lines)

@@ -20,7 +20,7 @@ from typing import Any
 
 from virest import __version__
 from virest.capture.location import is_remote
-from virest.errors import RestorationError, SettingsError
+from virest.errors import RestorationError, SettingsError, one_line
 from virest.image_formation import transforms
 
 log = logging.getLogger(__name__)
@@ -154,7 +154,7 @@ class ClusterExecutor(Executor):
             return dict(self._client.run(fn, *args))
         except Exception as error:  # an error of the worker, or of Dask itself
             raise SettingsError(
-                f"--scheduler {self.address}: a worker cannot do the work: {type(error).__name__}: {_line(error)}",
+                f"--scheduler {self.address}: a worker cannot do the work: {type(error).__name__}: {one_line(error)}",
                 hint=f"install virest {__version__} with its extra [cluster] on every worker",
             ) from error
 
@@ -209,7 +209,7 @@ def _connect(address: str, verbose: bool) -> Any:
         client = Client(address, timeout=_connect_s(), set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise SettingsError(
-            f"--scheduler {address}: {_line(error)}", hint="start `dask scheduler`, or omit --scheduler"
+            f"--scheduler {address}: {one_line(error)}", hint="start `dask scheduler`, or omit --scheduler"
         ) from error
     try:
         client.wait_for_workers(1, timeout=FIRST_WORKER_S)
@@ -226,7 +226,3 @@ async def _try_connection(address: str) -> None:
 
     comm = await connect(address, timeout=_connect_s())
     await comm.close()
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200]

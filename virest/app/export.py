@@ -39,6 +39,7 @@ from virest.app.outputs import json_text, output_error, write_picture
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu
 from virest.camera.orb_slam import format_orb_slam
 from virest.camera.profile_file import format_profile
+from virest.camera.yaml_mapping import commented
 from virest.capture.euroc import (
     format_camera_sensor,
     format_exposure_times,
@@ -112,7 +113,7 @@ def _write_scene(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> Non
         files = colmap_files(plan, poses)
     for name, text in files.items():
         _write(part / name, text)
-    _write(part / "camera.yaml", _commented(_said(plan)) + format_profile(plan.profile))
+    _write(part / "camera.yaml", commented(_said(plan)) + format_profile(plan.profile))
 
 
 @contextmanager
@@ -194,7 +195,7 @@ def _write_tables(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> No
         if imu.has_accelerometer:
             _write(part / "accelerometer.txt", _tum_accelerometer(plan.imu_time_ns, accel))
     _write(part / "times.txt", "".join(f"{time}\n" for time in times))
-    _write(part / "camera.yaml", _commented(_said(plan)) + format_profile(plan.profile))
+    _write(part / "camera.yaml", commented(_said(plan)) + format_profile(plan.profile))
     if plan.noise is not None:
         _write(part / "imu.yaml", format_imu(plan.noise, "export"))
     if plan.profile.intrinsics is not None:
@@ -223,10 +224,6 @@ def _said(plan: ExportPlan) -> list[str]:
         f"a frame shows the instant {1e3 * plan.instant_s:.4f} ms after its timestamp",
         *(note.text for note in plan.notes if not note.on_stamps),
     ]
-
-
-def _commented(lines: list[str]) -> str:
-    return "".join(f"# {' '.join(line.split())}\n" for line in lines)
 
 
 def _rate_hz(times_ns: list[int]) -> float:

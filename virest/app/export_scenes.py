@@ -156,11 +156,8 @@ def transforms_json(plan: ExportPlan, poses: list[FramePose]) -> str:
 
 
 def _nerfstudio_distortion(lens: Intrinsics) -> Json:
-    if lens.model == "fisheye":
-        return {"camera_model": "OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), lens.coefficients, strict=True))}
-    if not lens.is_distorted:
-        return {"camera_model": "OPENCV"}
-    return {"camera_model": "OPENCV", **dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.coefficients, strict=True))}
+    model = "OPENCV_FISHEYE" if lens.model == "fisheye" else "OPENCV"
+    return {"camera_model": model, **(lens.named_coefficients if lens.is_distorted else {})}
 
 
 def _nerfstudio_frame(plan: ExportPlan, pose: FramePose) -> Json:

@@ -64,6 +64,11 @@ class Intrinsics:
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     @property
+    def named_coefficients(self) -> dict[str, float]:
+        """The distortion coefficients by name, such as ``k1``; empty without distortion."""
+        return dict(zip(COEFFICIENT_NAMES[self.model], self.coefficients, strict=True))
+
+    @property
     def is_distorted(self) -> bool:
         """Whether distortion moves any pixel; that of the equidistant fisheye does even with zero coefficients."""
         return self.model == "fisheye" or any(self.coefficients) or self.displaced is not None

@@ -15,10 +15,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from virest.camera.intrinsics import COEFFICIENT_NAMES
 from virest.camera.lens_fit import standard_lens
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.profile_file import parse_profile
+from virest.camera.yaml_mapping import commented
 from virest.errors import SettingsError
 
 Array = NDArray[np.float64]
@@ -179,9 +179,9 @@ def format_camchain(
         raise SettingsError("Kalibr's camchain needs a focal length", hint="calibrate with --with focal")
     lens, off_px = standard_lens(lens)
     model, names = next((kalibr, own) for kalibr, (ours, own) in _DISTORTIONS.items() if ours == lens.model)
-    coefficients = dict(zip(COEFFICIENT_NAMES[lens.model], lens.coefficients, strict=True))
+    coefficients = lens.named_coefficients
     camera: dict[str, Any] = {
-        "T_cam_imu": _pose(profile),
+        "T_cam_imu": profile.pose_cam_imu.tolist(),
         "cam_overlaps": [],
         "camera_model": "pinhole",
         "distortion_coeffs": [coefficients[name] for name in names],
@@ -197,7 +197,7 @@ def format_camchain(
         camera["timeshift_cam_imu"] = profile.time_offset_s + shift_s
     lost = _not_held(profile, coefficients, names, exposure_s) if instant_s is None else _one_instant(profile)
     comments = [f"Kalibr camera chain, written by virest {command}", *lost, *field_notes(profile, off_px)]
-    return _commented(comments) + yaml.safe_dump({"cam0": camera}, default_flow_style=None, width=110)
+    return commented(comments) + yaml.safe_dump({"cam0": camera}, default_flow_style=None, width=110)
 
 
 def field_notes(profile: CameraProfile, off_px: float) -> list[str]:
@@ -254,11 +254,6 @@ def _digits(value: float) -> str:
     return str(yaml.safe_dump(float(f"{value:.6g}"))).splitlines()[0]
 
 
-def _pose(profile: CameraProfile) -> list[list[float]]:
-    rows = [[*row, shift] for row, shift in zip(profile.r_cam_imu, profile.p_cam_imu_m, strict=True)]
-    return [*rows, [0.0, 0.0, 0.0, 1.0]]
-
-
 def _has_line_delay(profile: CameraProfile) -> bool:
     return profile.readout_known and profile.shutter.readout_direction == "top_to_bottom"
 
@@ -303,10 +298,6 @@ def _not_held(
     if replace(profile.extensions, field=()) != Extensions():
         notes.append("Kalibr has none of the profile's extensions")
     return notes
-
-
-def _commented(lines: list[str]) -> str:
-    return "".join(f"# {' '.join(line.split())}\n" for line in lines)
 
 
 # ── measure ──────────────────────────────────────────────────────────────────────────────────────────────────────

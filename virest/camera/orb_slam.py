@@ -47,7 +47,7 @@ def format_orb_slam(
         raise SettingsError("ORB-SLAM3 needs a focal length", hint="give --config, or calibrate with --with focal")
     lines = ["%YAML:1.0", f"# ORB-SLAM3 settings, written by virest {command}", *(f"# {line}" for line in comments)]
     lines += ['File.version: "1.0"', f'Camera.type: "{CAMERAS[lens.model]}"']
-    held = dict(zip(COEFFICIENT_NAMES[lens.model], lens.coefficients, strict=True))
+    held = lens.named_coefficients
     names = COEFFICIENT_NAMES["fisheye"] if lens.model == "fisheye" else PINHOLE
     names += ("k3",) if lens.model == "radtan" and held["k3"] else ()
     numbers = {"fx": lens.fx_px, "fy": lens.fy_px, "cx": lens.cx_px, "cy": lens.cy_px}
@@ -65,9 +65,7 @@ def _inertial(profile: CameraProfile, noise: ImuNoise | None) -> list[str]:
     """The IMU block: the camera's pose on the inertial sensor, and the sensor's noise."""
     if noise is None or not noise.gyro_density or not noise.accel_density:
         return ["# no inertial block: too few samples, or no accelerometer"]
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = profile.rotation_cam_imu, profile.p_cam_imu_m
-    rows = [", ".join(real(value) for value in row) for row in np.linalg.inv(pose).tolist()]
+    rows = [", ".join(real(value) for value in row) for row in np.linalg.inv(profile.pose_cam_imu).tolist()]
     return [
         "IMU.T_b_c1: !!opencv-matrix",
         "   rows: 4",

@@ -23,6 +23,8 @@ BRIDGE_SLACK_S = 1e-3
 """Largest distance between the ends of a bridge and its stretch, which are rounded separately."""
 ANDROID_R_CAM_IMU = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """Rotation from the device axes to the stored portrait picture of an Android phone's rear camera."""
+LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+"""The same for a stored landscape picture, whose rows are those of the sensor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +137,13 @@ class CameraProfile:
     def rotation_cam_imu(self) -> NDArray[np.float64]:
         """R_cam_imu, (3, 3)."""
         return np.array(self.r_cam_imu)
+
+    @property
+    def pose_cam_imu(self) -> NDArray[np.float64]:
+        """T_cam_imu, (4, 4): x_cam = T_cam_imu x_imu, metres."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.r_cam_imu, self.p_cam_imu_m
+        return pose
 
     def imu_time_s(self, camera_time_s: Any) -> Any:
         """IMU clock of a camera time, both in seconds from stamp_0: t_cam (1 + clock_skew) + time_offset_s.

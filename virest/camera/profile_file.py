@@ -188,9 +188,7 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
     distortion: Any = "none"
     shape = lens or profile.lens_shape
     if shape and shape.model != "none":
-        names = COEFFICIENT_NAMES[shape.model]
-        distortion = {"model": shape.model, **dict(zip(names, shape.coefficients, strict=True))}
-    pose = [[*row, shift] for row, shift in zip(profile.r_cam_imu, profile.p_cam_imu_m, strict=True)]
+        distortion = {"model": shape.model, **shape.named_coefficients}
     depth = profile.depth_m
     extensions: dict[str, Any] = {}
     if ext.focal_drift_per_s:
@@ -246,7 +244,7 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
             "exposure_scale": profile.shutter.exposure_scale,
         },
         "imu": {
-            "T_cam_imu": [*pose, [0.0, 0.0, 0.0, 1.0]],
+            "T_cam_imu": profile.pose_cam_imu.tolist(),
             "time_offset_s": profile.time_offset_s,
             "clock_skew": profile.clock_skew,
             "gyro_bias_rad_s": list(profile.gyro_bias_rad_s),

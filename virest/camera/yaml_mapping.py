@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from virest.errors import SettingsError
+from virest.errors import SettingsError, printable
 
 MAX_PROFILE_BYTES = 1_000_000
 MAX_DEPTH = 20
@@ -51,6 +52,11 @@ def load_yaml_mapping(path: Path) -> dict[str, Any]:
     return content
 
 
+def commented(lines: Iterable[str]) -> str:
+    """Lines as comments at the head of a YAML file; line breaks inside become blanks."""
+    return "".join(f"# {' '.join(line.split())}\n" for line in lines)
+
+
 def _require_plain(text: str, name: str) -> None:
     """Refuse aliases, deep nesting and very long numbers before anything is built from them."""
     depth = 0
@@ -76,7 +82,7 @@ def _require_keys_once(node: yaml.Node | None, name: str) -> None:
     for key, value in node.value:
         if isinstance(key, yaml.ScalarNode):
             if key.value in seen:
-                shown = _printable(key.value[:60])
+                shown = printable(key.value[:60])
                 line = key.start_mark.line + 1
                 raise SettingsError(f"{name}: line {line}: '{shown}' is written a second time", hint="keep one of them")
             seen.add(key.value)
@@ -87,7 +93,7 @@ def explain_validation(error: ValidationError, model: type[BaseModel], name: str
     """One line for the first error of a pydantic validation; for an unknown key, with the nearest known one."""
     first = next((e for e in error.errors() if e["type"] == "extra_forbidden"), error.errors()[0])
     path = _key_path(first)
-    where = _printable(".".join(path))
+    where = printable(".".join(path))
     if first["type"] == "extra_forbidden":
         known = _keys_at(model, path[:-1])
         near = _nearest(path[-1], known)
@@ -95,7 +101,7 @@ def explain_validation(error: ValidationError, model: type[BaseModel], name: str
         return SettingsError(f"{name}: unknown key '{where[:80]}', {hint}")
     found = first.get("input")
     value = "" if isinstance(found, dict) else ", got null" if found is None else f", got {str(found)[:60]!r}"
-    message = _printable(first["msg"].removeprefix("Value error, ").split(" or instance of")[0])[:200]
+    message = printable(first["msg"].removeprefix("Value error, ").split(" or instance of")[0])[:200]
     return SettingsError(f"{name}: {where or 'top level'}: {message}{value}", hint="see docs/profile.md")
 
 
@@ -106,10 +112,6 @@ def _key_path(fault: Any) -> list[str]:
     is_key = last and not last.startswith(forms)
     keys = [part for part in above if not part.startswith(forms)]
     return [*keys, last] if is_key or fault["type"] == "extra_forbidden" else keys  # an unknown key has any name
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def _nearest(key: str, known: list[str]) -> str | None:

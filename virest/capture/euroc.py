@@ -24,13 +24,12 @@ from virest.camera.intrinsics import COEFFICIENT_NAMES
 from virest.camera.kalibr import ImuNoise, parse_camchain
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import parse_profile
-from virest.camera.yaml_mapping import load_yaml_mapping
+from virest.camera.yaml_mapping import commented, load_yaml_mapping
 from virest.capture.files import is_present, label, scan_text
 from virest.capture.pictures import read_picture_list
 from virest.capture.records import Note
-from virest.capture.source import ONE_CLOCK, FileNames, Source
+from virest.capture.source import FileNames, Source
 from virest.capture.tables import (
-    EdgeEpochs,
     GyroTable,
     MetadataTable,
     StampTable,
@@ -44,8 +43,6 @@ from virest.errors import CaptureError, ImuError, SettingsError
 SENSOR, LIST, TIMES = "sensor.yaml", "data.csv", "times.txt"
 CHAINS = ("camchain-imucam.yaml", "camchain.yaml", "dso/camchain.yaml")
 DISTORTIONS = {"radial-tangential": "radtan", "radtan": "radtan", "equidistant": "fisheye", "none": "none"}
-COEFFICIENTS = {"radtan": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4"), "none": ()}
-"""In EuRoC's order; radial-tangential has four or five."""
 IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -118,9 +115,8 @@ def read_euroc(folder: Path, notes: list[Note]) -> Source:
     files = (place.pictures, place.imu / LIST, *([times] if metadata else []), *described)
     pictures, exposures = label(place.pictures), f"dso/{place.camera.name}/{TIMES}"
     names = FileNames(pictures, pictures, exposures, label(place.imu / LIST))
-    epochs = EdgeEpochs(ONE_CLOCK, ())
     inputs = tuple(file for file in files if file.is_file())
-    return Source("EuRoC", place.pictures, movie, gyro, stamps, metadata, epochs, names, profile, inputs)
+    return Source("EuRoC", place.pictures, movie, gyro, stamps, metadata, names=names, profile=profile, inputs=inputs)
 
 
 def note_missing_pictures(dropped: dict[str, int], name: str, notes: list[Note]) -> None:
@@ -249,7 +245,7 @@ def _lens(content: dict[str, Any], name: str, notes: list[Note]) -> dict[str, An
         notes.append(Note("warning", "lens-model", text))
         return {}
     given = content.get("distortion_coefficients") or []
-    names = COEFFICIENTS[DISTORTIONS[kind]]
+    names = COEFFICIENT_NAMES[DISTORTIONS[kind]]  # radial-tangential may lack the last
     if not isinstance(given, list) or (names and not 4 <= len(given) <= len(names)):
         raise CaptureError(f"{name}: distortion_coefficients must be {len(names)} numbers", hint="repair it")
     distortion = {"model": DISTORTIONS[kind], **dict(zip(names, given, strict=False))}
@@ -317,9 +313,9 @@ def format_camera_sensor(profile: CameraProfile, rate_hz: float, comments: list[
     if lens is None:
         raise SettingsError("sensor.yaml needs a focal length", hint="give --config, or calibrate with --with focal")
     kind, names = ("equidistant", "k1 k2 k3 k4") if lens.model == "fisheye" else ("radial-tangential", "k1 k2 p1 p2")
-    held = dict(zip(COEFFICIENT_NAMES[lens.model], lens.coefficients, strict=True))
+    held = lens.named_coefficients
     names += " k3" if lens.model == "radtan" and held["k3"] else ""
-    body_from_cam = _inverse(cam_from_imu(profile))
+    body_from_cam = _inverse(profile.pose_cam_imu)
     content: dict[str, Any] = {
         "sensor_type": "camera",
         "comment": profile.device or "camera",
@@ -336,7 +332,7 @@ def format_camera_sensor(profile: CameraProfile, rate_hz: float, comments: list[
         content["line_delay_nanoseconds"] = 1e9 * shutter.readout_time_s / profile.height
     elif profile.readout_known:
         content |= {"readout_time_s": shutter.readout_time_s, "readout_direction": shutter.readout_direction}
-    return _commented(comments) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
+    return commented(comments) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
 
 
 def format_imu_sensor(noise: ImuNoise, comments: list[str]) -> str:
@@ -354,19 +350,8 @@ def format_imu_sensor(noise: ImuNoise, comments: list[str]) -> str:
         "accelerometer_random_walk": noise.accel_walk,
     }
     content |= {key: float(f"{value:.6g}") for key, value in densities.items() if value}
-    return _commented(comments) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
-
-
-def cam_from_imu(profile: CameraProfile) -> Array:
-    """T_cam_imu (4, 4)."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = profile.rotation_cam_imu, profile.p_cam_imu_m
-    return pose
+    return commented(comments) + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)
 
 
 def _inverse(pose: Array) -> Array:
     return np.asarray(np.linalg.inv(pose), np.float64) + 0.0  # no −0
-
-
-def _commented(lines: list[str]) -> str:
-    return "".join(f"# {' '.join(line.split())}\n" for line in lines)

@@ -25,6 +25,11 @@ class TextScan:
     """The first lines, at most MAX_LINE_BYTES, undecodable bytes replaced."""
     ends_with_newline: bool
 
+    @property
+    def first_line(self) -> str:
+        """The first line that is not blank; empty if there is none."""
+        return next((line for line in self.head.splitlines() if line.strip()), "")
+
 
 def label(path: Path) -> str:
     """Name a file in messages: its folder and its name."""

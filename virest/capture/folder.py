@@ -6,7 +6,7 @@ time, and everything skipped is counted and explained.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -54,6 +54,9 @@ __all__ = [
 ]
 
 GUESSED_FOCAL = 0.8
+"""Of the long side, as phones have: enough to decide whether the picture moves by more than half a pixel."""
+MOST_LISTED = 12
+"""Frames that a note lists; ``virest inspect --json`` has them all."""
 LARGE_RATE_RAD_S = 35.0
 """2000 °/s, the full scale of phone gyroscopes."""
 PLAUSIBLE_ACCEL_M_S2 = (5.0, 20.0)
@@ -235,7 +238,7 @@ def _startup(
     notes: list[Note],
     look_at_pictures: bool,
 ) -> start.Startup:
-    period = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    period = median_period_s(time_s)
     repeats: tuple[int, ...] = ()
     later: tuple[int, ...] = ()
     if look_at_pictures and len(time_s) > 2:
@@ -360,8 +363,7 @@ def _exposures_s(files: Source, joined: _Joined, time_s: NDArray[np.float64], no
         return [None] * len(time_s)
     missing = np.flatnonzero(~known)
     if len(missing):
-        shown = ", ".join(map(str, missing[:12])) + (" …" if len(missing) > 12 else "")
-        text = f"{len(missing)} of {len(known)} frames have no exposure time; it is interpolated: {shown}"
+        text = f"{len(missing)} of {len(known)} frames have no exposure time; it is interpolated: {_listed(missing)}"
         notes.append(Note("warning", "exposure-interpolated", text))
     return [float(value) for value in np.interp(time_s, time_s[known], logged[known])]
 
@@ -381,6 +383,11 @@ def _focal_scales(
         )
         notes.append(Note("info", "focal-varies", text))
     return scales
+
+
+def _listed(numbers: Sequence[int] | NDArray[np.intp]) -> str:
+    """The first numbers of the frames that a note is about."""
+    return ", ".join(map(str, numbers[:MOST_LISTED])) + (" …" if len(numbers) > MOST_LISTED else "")
 
 
 def _value(column: NDArray[np.float64], row: int) -> float | None:
@@ -423,8 +430,7 @@ def _note_frames(frames: tuple[Frame, ...], notes: list[Note]) -> None:
             hint="the gyroscope was not logged while the camera ran; see `virest inspect`",
         )
     if outside:
-        shown = ", ".join(map(str, outside[:12])) + (" …" if len(outside) > 12 else "")
-        text = f"{len(outside)} of {len(frames)} frames are not covered by IMU data and are skipped: {shown}"
+        text = f"{len(outside)} of {len(frames)} frames are not covered by IMU data and are skipped: {_listed(outside)}"
         notes.append(Note("warning", "frames-without-imu", text))
 
 

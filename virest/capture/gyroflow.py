@@ -18,19 +18,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.profile import CameraProfile
+from virest.camera.profile import LANDSCAPE_R_CAM_IMU, CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.files import label, scan_text
-from virest.capture.profile_source import LANDSCAPE_R_CAM_IMU
+from virest.capture.phone_tables import G_M_S2, movie_stamps
 from virest.capture.records import Note
-from virest.capture.source import ONE_CLOCK, ORIGIN_NS, FileNames, Source, find_movie, list_names
-from virest.capture.tables import EdgeEpochs, GyroTable, StampTable, make_gyro_table, read_rows, scaled_times_ns
+from virest.capture.source import ORIGIN_NS, FileNames, Source, find_movie, list_names
+from virest.capture.tables import GyroTable, make_gyro_table, read_rows, scaled_times_ns
 from virest.capture.video import MovieIndex, probe_movie
 from virest.errors import CaptureError, ImuError
 
 GCSV = ".gcsv"
 FIRST_LINES = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
-G_M_S2 = 9.80665
 SCALES = {"tscale": 0.001, "gscale": 1.0, "ascale": 1.0}
 """Scales by key, with Gyroflow's defaults."""
 DIRECTIONS = {
@@ -48,13 +47,13 @@ def read_gyroflow(folder: Path, notes: list[Note]) -> Source:
     gyro = read_log(path, header)
     movie_path = find_movie(folder, path.stem)
     movie = probe_movie(movie_path)
-    stamps = StampTable(movie.pts_ns + ORIGIN_NS, None, len(movie), {})
+    stamps = movie_stamps(movie)
     note_unknown_exposure(path.name, notes)
     _note_mirror(header, path, notes)
     names = FileNames(movie_path.name, f"the PTS of {movie_path.name}", path.name, path.name)
     profile = film_profile(movie, header.get("vendor", ""), _readout_s(header, path), _direction(header))
     inputs = (movie_path, path)
-    return Source("Gyroflow", movie_path, movie, gyro, stamps, None, EdgeEpochs(ONE_CLOCK, ()), names, profile, inputs)
+    return Source("Gyroflow", movie_path, movie, gyro, stamps, names=names, profile=profile, inputs=inputs)
 
 
 def film_profile(movie: MovieIndex, device: str, readout_s: float | None, direction: str) -> CameraProfile:

@@ -20,7 +20,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
 
-from virest.errors import SettingsError, VideoError
+from virest.errors import SettingsError, VideoError, one_line
 
 ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.\-]*)://(.*)", re.DOTALL)
 HERE = ("file", "local")
@@ -80,7 +80,7 @@ def _file_system(protocol: str) -> Any:
 
         return fsspec.filesystem(protocol, use_listings_cache=False)
     except ImportError as fault:
-        text = f"{protocol}:// needs a package that is not installed ({' '.join(str(fault).split())[:80]})"
+        text = f"{protocol}:// needs a package that is not installed ({one_line(fault, 80)})"
         raise SettingsError(text, hint=EXTRA) from None
     except ValueError:
         text = f"{protocol}://: unknown protocol"
@@ -95,13 +95,9 @@ def _plain_errors(path: RemotePath) -> Iterator[None]:
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path)) from None
     except PermissionError as fault:
-        raise PermissionError(errno.EACCES, _line(fault) or "access denied", str(path)) from None
+        raise PermissionError(errno.EACCES, one_line(fault) or "access denied", str(path)) from None
     except Exception as fault:  # botocore, aiohttp and google each have their own exceptions
-        raise OSError(errno.EIO, f"{type(fault).__name__}: {_line(fault)}", str(path)) from None
-
-
-def _line(fault: BaseException) -> str:
-    return " ".join(str(fault).split())[:200]
+        raise OSError(errno.EIO, f"{type(fault).__name__}: {one_line(fault)}", str(path)) from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,7 +99,7 @@ def _require_kind(scan: TextScan, path: Path, expected: str, error: type[Capture
     kind = identify(scan.head)
     if kind == expected or (expected == STAMPS and kind == BARE_STAMPS):
         return
-    line = next(text for text in scan.head.splitlines() if text.strip())
+    line = scan.first_line
     separated = [mark for mark in ("\t", ";") if mark in line and identify(scan.head.replace(mark, ",")) == expected]
     if separated:
         mark = "tabs" if separated[0] == "\t" else "semicolons"
@@ -237,7 +237,7 @@ def read_movie_metadata(path: Path) -> MetadataTable:
     """
     scan = scan_text(path)
     _require_kind(scan, path, METADATA, CaptureError)
-    columns = normalised_columns(next(line for line in scan.head.splitlines() if line.strip()))
+    columns = normalised_columns(scan.first_line)
     if columns[0] != "timestamp[nanosec]":
         raise CaptureError(f"{label(path)}: first column is '{columns[0][:40]}'", hint="expected Timestamp[nanosec]")
     places = {name: _place(columns, spellings) for name, spellings in _METADATA_COLUMNS.items()}
@@ -274,7 +274,7 @@ def read_frame_timestamps(path: Path) -> StampTable:
     """
     scan = scan_text(path)
     _require_kind(scan, path, STAMPS, CaptureError)
-    columns = normalised_columns(next(line for line in scan.head.splitlines() if line.strip()))
+    columns = normalised_columns(scan.first_line)
     bare = identify(scan.head) == BARE_STAMPS
     has_unix = "unixtime[nanosec]" in columns[1:2]
     dropped: Counter[str] = Counter()

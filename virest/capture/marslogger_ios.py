@@ -21,13 +21,13 @@ import numpy as np
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.files import is_present, label, scan_text
-from virest.capture.join import COARSEST_TICK_NS, align_frames, pts_tolerance_ns
+from virest.capture.join import COARSEST_TICK_NS, align_frames, match_times, pts_tolerance_ns
 from virest.capture.marslogger_android import normalised_columns, read_gyro_accel
+from virest.capture.phone_tables import G_M_S2
 from virest.capture.profile_source import phone_profile
 from virest.capture.records import Note
-from virest.capture.source import GYRO, METADATA, ONE_CLOCK, FileNames, Source, find_movie
+from virest.capture.source import GYRO, METADATA, FileNames, Source, find_movie
 from virest.capture.tables import (
-    EdgeEpochs,
     Float64,
     GyroTable,
     Int64,
@@ -43,7 +43,6 @@ from virest.capture.video import MovieIndex, probe_movie
 from virest.errors import CaptureError, ImuError
 
 RAW_GYRO, ARKIT_FRAMES, ARKIT_IMU = "raw_accel_gyro.csv", "frames.csv", "imu.csv"
-G_M_S2 = 9.80665
 APP_G_M_S2 = 9.80
 """The value of g in the Objective-C app."""
 KNOWN_FOCAL_PX = 1.5
@@ -52,7 +51,6 @@ FLOAT32_STEP = 2.0**-23
 PRINTED_DIGITS = 9
 COARSE_NS = 1e5
 """Note times on a coarser grid than this."""
-ONE = EdgeEpochs(ONE_CLOCK, ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +86,9 @@ def read_ios_marslogger(folder: Path, notes: list[Note]) -> Source:
     profile = _profile(movie, lens, "iPhone, MARSLogger for iOS")
     names = FileNames(path.name, METADATA, METADATA, samples.name)
     inputs = (path, folder / METADATA, samples)
-    return Source("MARSLogger for iOS", path, movie, gyro, stamps, metadata, ONE, names, profile, inputs)
+    return Source(
+        "MARSLogger for iOS", path, movie, gyro, stamps, metadata, names=names, profile=profile, inputs=inputs
+    )
 
 
 def _read_gyro(path: Path) -> GyroTable:
@@ -150,7 +150,9 @@ def read_ios_arkit(folder: Path, notes: list[Note]) -> Source:
     profile = _profile(movie, lens, "iPhone, MARSLogger for ARKit")
     names = FileNames(path.name, ARKIT_FRAMES, ARKIT_FRAMES, ARKIT_IMU)
     inputs = (path, folder / ARKIT_FRAMES, folder / ARKIT_IMU)
-    return Source("MARSLogger for iOS (ARKit)", path, movie, gyro, stamps, metadata, ONE, names, profile, inputs)
+    return Source(
+        "MARSLogger for iOS (ARKit)", path, movie, gyro, stamps, metadata, names=names, profile=profile, inputs=inputs
+    )
 
 
 def printed_grid_ns(time_ns: float) -> float:
@@ -185,7 +187,7 @@ def _read_arkit_frames(path: Path, movie: MovieIndex) -> tuple[Rows, _Lens]:
 
 def _header(path: Path, first: str, error: type[CaptureError]) -> tuple[str, ...]:
     scan = scan_text(path, error, "copy it from the app's folder")
-    columns = normalised_columns(next((line for line in scan.head.splitlines() if line.strip()), ""))
+    columns = normalised_columns(scan.first_line)
     if first not in columns[:1]:
         raise error(f"{label(path)}: first column is '{columns[0][:40]}', not {first}", hint="is it the app's file?")
     return columns
@@ -221,10 +223,8 @@ def stamps_from_movie(movie: MovieIndex, rows: Rows, grid_ns: float, what: str, 
 
 def _refined(rows_ns: Int64, stamps_ns: Int64, grid_ns: float) -> Int64:
     """Row times replaced by the timestamp that they were printed from; rows of no frame stay as they are."""
-    nearest = np.clip(np.searchsorted(stamps_ns, rows_ns), 1, len(stamps_ns) - 1) if len(stamps_ns) > 1 else 0
-    before, after = stamps_ns[np.maximum(nearest - 1, 0)], stamps_ns[nearest]
-    stamp = np.where(np.abs(before - rows_ns) <= np.abs(after - rows_ns), before, after)
-    return np.asarray(np.where(np.abs(stamp - rows_ns) <= grid_ns + COARSEST_TICK_NS, stamp, rows_ns), np.int64)
+    nearest = match_times(rows_ns, stamps_ns, grid_ns + COARSEST_TICK_NS)
+    return np.asarray(np.where(nearest >= 0, stamps_ns[nearest], rows_ns), np.int64)
 
 
 def _profile(movie: MovieIndex, lens: _Lens, device: str) -> CameraProfile:

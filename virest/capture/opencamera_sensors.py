@@ -10,6 +10,7 @@ Axes are Android's device axes; pictures are stored in landscape, as the sensor 
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,8 @@ from virest.capture.phone_tables import at_times, note_exposures, without_accele
 from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.profile_source import phone_profile
 from virest.capture.records import Note
-from virest.capture.source import ONE_CLOCK, FileNames, Source, find_movie, list_names
+from virest.capture.source import FileNames, Source, find_movie, list_names
 from virest.capture.tables import (
-    EdgeEpochs,
     Float64,
     Int64,
     StampTable,
@@ -65,11 +65,10 @@ def read_opencamera_sensors(folder: Path, notes: list[Note]) -> Source:
     gyro = make_gyro_table(folder / gyro_name, time_ns, np.hstack([rates, accel]), rows, {})
     note_exposures(notes)
     files = FileNames(path.name, stamps_name, stamps_name, gyro_name)
-    inputs = tuple(place for place in (path, *(folder / n for n in (gyro_name, accel_name, stamps_name) if n)))
+    inputs = (path, *(folder / name for name in (gyro_name, accel_name, stamps_name) if name))
     profile = phone_profile(movie.width, movie.height, "OpenCamera-Sensors")
     stamps = _read_stamps(folder / stamps_name)
-    epochs = EdgeEpochs(ONE_CLOCK, ())
-    return Source("OpenCamera-Sensors", path, movie, gyro, stamps, None, epochs, files, profile, inputs)
+    return Source("OpenCamera-Sensors", path, movie, gyro, stamps, names=files, profile=profile, inputs=inputs)
 
 
 def _find(names: set[str], endings: tuple[str, ...]) -> str | None:
@@ -92,8 +91,6 @@ def _movie(folder: Path, gyro_name: str) -> Path:
 
 def _read_sensor(path: Path) -> tuple[Int64, Float64, int]:
     """Times (n,), values (n, 3) and the number of rows of a file X, Y, Z, ns."""
-    from collections import Counter
-
     times: list[Int64] = [np.zeros(0, np.int64)]
     values: list[Float64] = [np.zeros((0, 3))]
     rows = 0

@@ -12,6 +12,7 @@ from virest.capture.tables import Float64, Int64, StampTable
 from virest.capture.video import MovieIndex
 
 G_M_S2 = 9.80665
+"""Standard gravity, exact by definition (3rd CGPM, 1901): the unit of accelerations that are logged in g."""
 NO_EXPOSURES = "the recorder logs no exposure times: frames are straightened, not deblurred, until they are known"
 
 

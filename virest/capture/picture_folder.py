@@ -16,7 +16,7 @@ from virest.capture.marslogger_android import read_edge_epochs, read_gyro_accel,
 from virest.capture.pictures import find_picture_source, read_picture_list
 from virest.capture.records import Note
 from virest.capture.source import EPOCHS, GYRO, METADATA, ONE_CLOCK, FileNames, Source, present
-from virest.capture.tables import EdgeEpochs, MetadataTable, StampTable
+from virest.capture.tables import MetadataTable, StampTable
 from virest.capture.video import index_pictures
 from virest.errors import VideoError
 
@@ -38,8 +38,8 @@ def read_picture_folder(folder: Path, notes: list[Note]) -> Source:
         metadata = read_movie_metadata(folder / METADATA)
     else:
         notes.append(Note("warning", "exposure-unknown", f"no {METADATA}: no exposure times, no deblurring"))
-    epochs = read_edge_epochs(folder / EPOCHS) if is_present(folder / EPOCHS) else EdgeEpochs(ONE_CLOCK, ())
+    epochs = read_edge_epochs(folder / EPOCHS) if is_present(folder / EPOCHS) else ONE_CLOCK
     stamps = StampTable(listed.time_ns, None, listed.rows, listed.dropped)
     names = FileNames(path.name, f"{path.name} (pictures)", METADATA, samples.name)
     inputs = (*([path] if path.is_file() else []), samples, *present(folder, METADATA, EPOCHS))
-    return Source("pictures", path, movie, gyro, stamps, metadata, epochs, names, None, inputs)
+    return Source("pictures", path, movie, gyro, stamps, metadata, epochs, names, inputs=inputs)

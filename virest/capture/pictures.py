@@ -32,6 +32,7 @@ PLACES = ("", "data", "rgb", "images", "frames", "color")
 """Folders of the pictures, relative to the list's folder."""
 MAX_BYTES = 1 << 28
 MAX_SIDE_PX = 16384
+"""Twice the side of 8K; also of the frames of a movie."""
 SIXTEEN_BITS = 257.0
 """16-bit steps per 8-bit grey level."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"

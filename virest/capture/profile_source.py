@@ -10,7 +10,7 @@ import numpy as np
 
 from virest.camera.field import Field
 from virest.camera.kalibr import is_kalibr, parse_camchain
-from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile
+from virest.camera.profile import ANDROID_R_CAM_IMU, LANDSCAPE_R_CAM_IMU, CameraProfile
 from virest.camera.profile_file import parse_profile
 from virest.camera.shutter import Shutter
 from virest.camera.yaml_mapping import load_yaml_mapping
@@ -23,8 +23,6 @@ from virest.errors import SettingsError
 log = logging.getLogger(__name__)
 
 PROFILE_NAME = "camera.yaml"
-LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-"""Stored landscape picture of an Android phone's rear camera (sensor rows horizontal) against the device axes."""
 
 
 def default_profile(capture: Capture) -> CameraProfile:

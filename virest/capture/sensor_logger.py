@@ -20,8 +20,8 @@ from virest.capture.files import is_present, label, scan_text
 from virest.capture.phone_tables import at_times, movie_stamps, note_exposures, without_accelerometer
 from virest.capture.profile_source import phone_profile
 from virest.capture.records import Note
-from virest.capture.source import ONE_CLOCK, FileNames, Source, find_movie, present
-from virest.capture.tables import EdgeEpochs, Float64, GyroTable, Rows, make_gyro_table, read_rows
+from virest.capture.source import FileNames, Source, find_movie, present
+from virest.capture.tables import Float64, GyroTable, Rows, make_gyro_table, read_rows
 from virest.capture.video import probe_movie
 from virest.errors import ImuError
 
@@ -63,10 +63,8 @@ def read_sensor_logger(folder: Path, notes: list[Note]) -> Source:
     names = FileNames(path.name, f"the PTS of {path.name}", path.name, GYROSCOPE)
     inputs = (path, *present(folder, GYROSCOPE, TOTAL, LINEAR, GRAVITY, METADATA_CSV))
     profile = phone_profile(movie.width, movie.height, "Sensor Logger")
-    epochs = EdgeEpochs(ONE_CLOCK, ())
-    return Source(
-        "Sensor Logger", path, movie, gyro, movie_stamps(movie, start_ns), None, epochs, names, profile, inputs
-    )
+    stamps = movie_stamps(movie, start_ns)
+    return Source("Sensor Logger", path, movie, gyro, stamps, names=names, profile=profile, inputs=inputs)
 
 
 def columns_of(path: Path) -> tuple[str, ...]:

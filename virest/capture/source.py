@@ -7,14 +7,15 @@ from pathlib import Path
 
 from virest.camera.profile import CameraProfile
 from virest.capture.files import is_present, label
+from virest.capture.marslogger_android import GYRO, METADATA, STAMPS
 from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.tables import EdgeEpochs, GyroTable, MetadataTable, StampTable
 from virest.capture.video import MovieIndex
 from virest.errors import CaptureError, VideoError
 
-MOVIE, STAMPS, METADATA = "movie.mp4", "frame_timestamps.txt", "movie_metadata.csv"
-GYRO, EPOCHS, UNFINISHED = "gyro_accel.csv", "edge_epochs.txt", ".marslogger_recording_in_progress"
-ONE_CLOCK = "one clock"
+MOVIE, EPOCHS, UNFINISHED = "movie.mp4", "edge_epochs.txt", ".marslogger_recording_in_progress"
+ONE_CLOCK = EdgeEpochs("one clock", ())
+"""Of a recording whose stamps and samples share one clock by its format."""
 ORIGIN_NS = 1_000_000_000_000
 """Timestamp of the first frame if a recording's clock starts with it: 1000 s, so that no time is negative."""
 
@@ -40,8 +41,8 @@ class Source:
     movie: MovieIndex
     gyro: GyroTable
     stamps: StampTable | None
-    metadata: MetadataTable | None
-    epochs: EdgeEpochs
+    metadata: MetadataTable | None = None
+    epochs: EdgeEpochs = ONE_CLOCK
     names: FileNames = FileNames()
     profile: CameraProfile | None = None
     """The recorder's description of camera and axes; None: nothing beyond the metadata."""

@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture.files import label, read_small_text, require_regular_file
+from virest.capture.pictures import PNG_SIGNATURE
 from virest.capture.records import NO_STAMP, STARTUP, Capture, Frame
 from virest.capture.video import probe_movie, read_frames
-from virest.errors import CalibrationError, CaptureError
+from virest.errors import CalibrationError, CaptureError, printable
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 COLUMNS = ("file", "exposure_s")
@@ -31,7 +32,6 @@ MAX_STILL_BYTES = 400 << 20
 MAX_SAMPLED_PX = 4_000_000
 """Larger pictures are reduced by an integer factor, by block means."""
 MAX_CSV_LINE = 4096
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_IFD_ENTRIES = 512
 EXIF_IFD, EXPOSURE_TIME, F_NUMBER, ISO = 0x8769, 0x829A, 0x829D, 0x8827
 MAX_GROUPS = 12
@@ -140,7 +140,7 @@ def read_exposures(path: Path, names: list[str]) -> dict[str, float]:
 
 def _shown(text: str) -> str:
     short = text if len(text) <= 60 else text[:57] + "..."
-    return "".join(c if c.isprintable() else "?" for c in short)
+    return printable(short)
 
 
 def _csv_header(row: list[str], where: str) -> list[str]:

@@ -22,8 +22,8 @@ from virest.capture.marslogger_ios import stamps_from_movie
 from virest.capture.phone_tables import G_M_S2, note_exposures, without_accelerometer
 from virest.capture.profile_source import phone_profile
 from virest.capture.records import Note
-from virest.capture.source import ONE_CLOCK, FileNames, Source, find_movie, present
-from virest.capture.tables import EdgeEpochs, GyroTable, make_gyro_table, read_rows
+from virest.capture.source import FileNames, Source, find_movie, present
+from virest.capture.tables import GyroTable, make_gyro_table, read_rows
 from virest.capture.video import MovieIndex, probe_movie
 from virest.errors import CaptureError
 
@@ -52,8 +52,7 @@ def read_stray_scanner(folder: Path, notes: list[Note]) -> Source:
     inputs = (path, *present(folder, MATRIX, ODOMETRY, IMU))
     profile = _with_matrix(phone_profile(movie.width, movie.height, "iPhone, Stray Scanner"), folder / MATRIX, movie)
     gyro = _read_motion(folder, notes)
-    epochs = EdgeEpochs(ONE_CLOCK, ())
-    return Source("Stray Scanner", path, movie, gyro, stamps, None, epochs, names, profile, inputs)
+    return Source("Stray Scanner", path, movie, gyro, stamps, names=names, profile=profile, inputs=inputs)
 
 
 def _read_motion(folder: Path, notes: list[Note]) -> GyroTable:

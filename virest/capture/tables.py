@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture.files import label, scan_text
-from virest.errors import CaptureError, ClockError, ImuError
+from virest.errors import CaptureError, ClockError, ImuError, one_line
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -132,9 +132,7 @@ def text_chunks(path: Path, separator: str = ",", fields: int = MAX_FIELDS) -> I
         except pd.errors.EmptyDataError:
             return
         except (pd.errors.ParserError, OSError) as fault:
-            raise CaptureError(
-                f"{label(path)}: {' '.join(str(fault).split())}", hint="copy the logger's file again"
-            ) from None
+            raise CaptureError(f"{label(path)}: {one_line(fault)}", hint="copy the logger's file again") from None
 
 
 def numbers(column: Any) -> Float64:

@@ -14,11 +14,12 @@ import numpy as np
 
 from virest.capture.files import label
 from virest.capture.gyroflow import film_profile, note_unknown_exposure
+from virest.capture.phone_tables import movie_stamps
 from virest.capture.records import Note
-from virest.capture.source import GYRO, ONE_CLOCK, ORIGIN_NS, FileNames, Source, find_movie
-from virest.capture.tables import EdgeEpochs, Float64, GyroTable, StampTable, keep_rising, make_gyro_table
+from virest.capture.source import GYRO, ORIGIN_NS, FileNames, Source, find_movie
+from virest.capture.tables import Float64, GyroTable, keep_rising, make_gyro_table
 from virest.capture.video import probe_movie
-from virest.errors import ImuError
+from virest.errors import ImuError, one_line
 
 log = logging.getLogger(__name__)
 
@@ -34,13 +35,12 @@ def read_telemetry(folder: Path, notes: list[Note]) -> Source:
     movie = probe_movie(path)
     camera, rows = _parse(path)
     gyro = gyro_table(path, rows)
-    stamps = StampTable(movie.pts_ns + ORIGIN_NS, None, len(movie), {})
+    stamps = movie_stamps(movie)
     note_unknown_exposure(path.name, notes)
     names = FileNames(path.name, f"the PTS of {path.name}", path.name, path.name)
     profile = film_profile(movie, camera, None, "top_to_bottom")
-    return Source(
-        f"telemetry ({camera})", path, movie, gyro, stamps, None, EdgeEpochs(ONE_CLOCK, ()), names, profile, (path,)
-    )
+    kind = f"telemetry ({camera})"
+    return Source(kind, path, movie, gyro, stamps, names=names, profile=profile, inputs=(path,))
 
 
 def _parse(path: Path) -> tuple[str, list[dict[str, Any]]]:
@@ -59,14 +59,11 @@ def _parse(path: Path) -> tuple[str, list[dict[str, Any]]]:
         if isinstance(fault, KeyboardInterrupt | SystemExit | MemoryError):
             raise
         log.debug("%s: telemetry-parser: %s", path.name, fault)
-        text = f"{label(path)}: holds no inertial samples that telemetry-parser can read ({_short(fault)})"
+        why = one_line(fault, 60).lower() or type(fault).__name__
+        text = f"{label(path)}: holds no inertial samples that telemetry-parser can read ({why})"
         raise ImuError(
             text, hint=f"copy {GYRO} or a .gcsv into the folder; a copied movie loses its telemetry"
         ) from None
-
-
-def _short(fault: BaseException) -> str:
-    return " ".join(str(fault).split())[:60].lower() or type(fault).__name__
 
 
 def gyro_table(path: Path, samples: list[dict[str, Any]]) -> GyroTable:

@@ -25,13 +25,19 @@ from numpy.typing import NDArray
 from virest.capture.coding_step import coding_step
 from virest.capture.files import label, require_regular_file
 from virest.capture.location import RemotePath, unreachable
-from virest.capture.pictures import PictureList, first_size, is_picture_source, read_picture_list, read_pictures
+from virest.capture.pictures import (
+    MAX_SIDE_PX,
+    PictureList,
+    first_size,
+    is_picture_source,
+    read_picture_list,
+    read_pictures,
+)
 from virest.capture.pixels import to_gray, to_rgb
-from virest.errors import VideoError
+from virest.errors import VideoError, printable
 
 log = logging.getLogger(__name__)
 
-MAX_SIDE_PX = 16384
 MAX_PIXELS = 40_000_000
 """8K and a margin; also checked against the coded pictures' own size before memory is allocated."""
 MAX_FRAMES = 2_000_000
@@ -146,7 +152,7 @@ def _missing_movie_hint(path: Path) -> str:
         return needs
     if not others:
         return needs
-    shown = "".join(c if c.isprintable() else "?" for c in others[0][:60])
+    shown = printable(others[0][:60])
     what = "rename it" if Path(others[0]).suffix.lower() in OWN_SUFFIXES else "ffmpeg -i FILE -c copy movie.mp4"
     return f"{needs}; is it '{shown}'? {what}"
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from virest.calibration.response_curve import CurveFit
 from virest.effects.records import PHOTOMETRY
+from virest.errors import printable
 
 FORMATS = ("png", "svg", "pdf")
 MAX_POINTS = 12_000
@@ -45,7 +46,7 @@ def response_figure(fit: CurveFit, title: str = "", image_format: str = "png") -
 
 def literal(text: str) -> str:
     """Text drawn literally: no math mode, one line."""
-    return "".join(c if c.isprintable() else "?" for c in text).replace("$", r"\$")
+    return printable(text).replace("$", r"\$")
 
 
 def _thinned(fit: CurveFit) -> slice:

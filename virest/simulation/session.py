@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile
+from virest.camera.profile import ANDROID_R_CAM_IMU, LANDSCAPE_R_CAM_IMU, CameraProfile
 from virest.camera.profile_file import require_usable
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
@@ -33,7 +33,6 @@ from virest.simulation.sensor import eight_bit, grey_of_light, noisy_levels, rou
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 GRAVITY_WORLD_M_S2 = np.array([0.0, 9.81, 0.0])
 """World y points down."""
 TICKS_PER_S = 90_000
