@@ -9,7 +9,7 @@ from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.local_blur_fit import Defocus, ExposureTime
 from virest.diagnosis.photometry_effects import BlackLevel, Flicker, ResponseGamma, Vignetting
-from virest.simulation.effects import effect_names
+from virest.simulation.effects import EFFECTS
 
 SPECIAL = {"scene_depth", "frame_lag"}
 """Judged with the points, without being a term of their fit: a plane, and other stamps."""
@@ -17,7 +17,7 @@ SPECIAL = {"scene_depth", "frame_lag"}
 
 def test_the_simulator_hides_what_the_catalogue_names_and_nothing_else() -> None:
     """25 effects on both sides."""
-    assert set(effect_names()) == set(CATALOGUE)
+    assert set(EFFECTS) == set(CATALOGUE)
     assert len(CATALOGUE) == 25
 
 

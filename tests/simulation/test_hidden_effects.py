@@ -9,7 +9,7 @@ from capture_files import SMALL, read_imu, read_movie
 
 from virest.camera.profile_file import profile_mapping, read_profile
 from virest.errors import SettingsError
-from virest.simulation.effects import EffectContext, effect_names, hide_effects
+from virest.simulation.effects import EFFECTS, EffectContext, hide_effects
 from virest.simulation.hand_motion import random_hand_motion
 from virest.simulation.hidden import Hidden, shaded
 from virest.simulation.phone_gyro import before_low_pass, low_passed_rate
@@ -62,7 +62,7 @@ def flat(profile):
 
 def test_every_name_of_the_contract_is_known():
     """And no other."""
-    assert set(effect_names()) == set(CHANGES)
+    assert set(EFFECTS) == set(CHANGES)
 
 
 @pytest.mark.parametrize("name", CHANGES)

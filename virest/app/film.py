@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.outputs import output_error
+from virest.capture.join import TICKS_PER_S
+from virest.capture.pixels import BT601
 from virest.errors import OutputError
 
 Picture = NDArray[np.uint8]
-TICKS_PER_S = 90_000
 QUALITY = "17"
 """x264's constant rate factor: hardly distinguishable from the PNGs."""
-BT601 = 6
 UPRIGHT = (1, 0, 0, 1)
 _BOXES_WITH_BOXES = (b"moov", b"trak", b"mdia")
 _MOST_HEADER_BYTES = 64 * 2**20

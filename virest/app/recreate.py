@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.app.simulate import recording_facts
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.join import median_period_s
 from virest.capture.pictures import is_picture_source, read_picture_list
 from virest.capture.records import Capture, Frame
 from virest.capture.video import probe_movie, read_decodable_gray, read_frames
@@ -26,7 +28,7 @@ from virest.restoration.settings import PRESETS, RestorationSettings
 from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.recreation import ScenePicture, known_frames, recreate_session
-from virest.simulation.session import Session, SessionSettings
+from virest.simulation.session import SessionSettings
 
 log = logging.getLogger(__name__)
 
@@ -78,17 +80,8 @@ def simulate_like(
     return {
         "capture": str(folder),
         "like": str(capture.folder),
-        "scene": f"frame {scene.frame}, restored",
-        "width": nominal.width,
-        "height": nominal.height,
-        "frames": len(kept),
-        "fps": round(session.settings.fps, 4),
-        "exposure_ms": _range_ms(kept),
-        "readout_ms": nominal.shutter.readout_time_s * 1000,
-        "readout_direction": nominal.shutter.readout_direction,
-        "seed": seed,
-        "blur_px": blur_px(session),
-        "effects": [{"name": effect.name, "parameters": effect.parameters} for effect in applied],
+        **recording_facts(session, f"frame {scene.frame}, restored", round(session.settings.fps, 4), _range_ms(kept)),
+        "effects": [dataclasses.asdict(effect) for effect in applied],
     }
 
 
@@ -134,17 +127,6 @@ def restored_scene(capture: Capture, plan: RestorationPlan, number: int) -> Scen
     return ScenePicture(restored.picture, number, restored.valid_px)
 
 
-def blur_px(session: Session) -> float:
-    """Median over the frames of the image motion at the centre during one exposure, in pixels."""
-    lens = session.true.intrinsics
-    assert lens is not None
-    captures = session.shows.tolist()
-    begin = np.array([session.first_row_start_s(k) for k in captures]) + 0.5 * session.true.shutter.readout_time_s
-    lasting = np.array([session.true_exposure_s(k) for k in captures])
-    turn = session.motion.rotation(begin).inv() * session.motion.rotation(begin + lasting)
-    return round(lens.fx_px * float(np.median(np.linalg.norm(turn.as_rotvec()[:, :2], axis=1))), 2)
-
-
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -175,8 +157,8 @@ def _scene_order(capture: Capture, profile: CameraProfile, frames: Sequence[Fram
 
 
 def _fps(frames: Sequence[Frame]) -> float:
-    steps = np.diff([frame.time_s for frame in frames])
-    return float(1 / np.median(steps)) if len(steps) else 30.0
+    period_s = median_period_s(np.array([frame.time_s for frame in frames]))
+    return 1 / period_s if len(frames) > 1 else 30.0
 
 
 def _bits_per_px(capture: Capture) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -123,19 +124,27 @@ def simulate_command(
     )  # fmt: skip
     return {
         "capture": str(folder),
+        **recording_facts(session, scene, fps, exposures_ms),
+        **_exposed(session),
+        **({"isp": isp.in_force()} if isp.in_force() else {}),
+        "effects": [dataclasses.asdict(effect) for effect in applied],
+    }
+
+
+def recording_facts(session: Session, scene: str, fps: float, exposure_ms: list[float]) -> dict[str, Any]:
+    """Facts of any simulated recording for ``--json``."""
+    nominal = session.nominal
+    return {
         "scene": scene,
         "width": nominal.width,
         "height": nominal.height,
-        "frames": frames,
+        "frames": session.settings.frames,
         "fps": fps,
-        "exposure_ms": exposures_ms,
+        "exposure_ms": exposure_ms,
         "readout_ms": nominal.shutter.readout_time_s * 1000,
         "readout_direction": nominal.shutter.readout_direction,
-        "seed": seed,
-        "blur_px": _blur_px(session),
-        **_exposed(session),
-        **({"isp": isp.in_force()} if isp.in_force() else {}),
-        "effects": [{"name": effect.name, "parameters": effect.parameters} for effect in applied],
+        "seed": session.settings.seed,
+        "blur_px": session.blur_px(),
     }
 
 
@@ -191,16 +200,3 @@ def parse_response(text: str) -> ResponseCurve:
         xb, yb, xc, yc, top = values or (0.12, 0.08, 0.62, 0.80, 1.0)
         return ResponseCurve("five_segment", b=(xb, yb), c=(xc, yc), y_max=top)
     raise SettingsError(f"response '{text}' is not a curve", hint="use srgb, linear, gamma:2.2 or five_segment")
-
-
-def _blur_px(session: Session) -> float:
-    """Median over the frames of the image motion at the centre during one exposure, in pixels."""
-    lens = session.true.intrinsics
-    assert lens is not None
-    lengths = []
-    for capture in session.shows.tolist():
-        start, exposure = session.first_row_start_s(capture), session.true_exposure_s(capture)
-        begin = start + 0.5 * session.true.shutter.readout_time_s
-        turn = session.motion.rotation(np.array([begin, begin + exposure]))
-        lengths.append(lens.fx_px * float(np.linalg.norm((turn[0].inv() * turn[1]).as_rotvec()[:2])))
-    return round(float(np.median(lengths)), 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,9 @@ from virest.capture.records import IMU_GAP, NO_IMU
 from virest.capture.tables import EdgeEpochs
 from virest.errors import ClockError
 
-TICK_90KHZ_NS = 1e9 / 90_000
+TICKS_PER_S = 90_000
+"""Movie clock of Android's recorder: the 90 kHz of MPEG timestamps (ISO/IEC 13818-1, 2.4.3.7)."""
+TICK_90KHZ_NS = 1e9 / TICKS_PER_S
 STAMP_STEP_NS = 1000
 """Timestamps are truncated to whole microseconds."""
 COARSEST_TICK_NS = 1e6
@@ -171,6 +174,13 @@ def clock_shift_ns(
         hint="the files come from different sessions, or edge_epochs.txt is missing or wrong",
         source=epochs.source,
     )
+
+
+def consecutive_runs(numbers: Iterable[int] | Int64) -> list[tuple[int, int]]:
+    """First and last of each run of consecutive numbers, ascending."""
+    ascending = np.array(sorted(set(numbers)), np.int64)
+    parts = np.split(ascending, np.flatnonzero(np.diff(ascending) > 1) + 1) if len(ascending) else []
+    return [(int(part[0]), int(part[-1])) for part in parts]
 
 
 # ── coverage ─────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -65,11 +65,6 @@ class AppliedEffect:
     parameters: dict[str, Any]
 
 
-def effect_names() -> tuple[str, ...]:
-    """Names that ``--effect`` accepts."""
-    return tuple(EFFECTS)
-
-
 def hide_effects(
     nominal: CameraProfile, texts: list[str] | tuple[str, ...], context: EffectContext
 ) -> tuple[CameraProfile, tuple[AppliedEffect, ...]]:

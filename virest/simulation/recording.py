@@ -23,10 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.profile_file import write_profile
+from virest.capture.join import TICKS_PER_S
+from virest.capture.pixels import BT601
 from virest.errors import OutputError, SettingsError
 from virest.simulation.effects import AppliedEffect
 from virest.simulation.session import (
-    TICKS_PER_S,
     ImuLog,
     Session,
     phone_pictures,
@@ -241,8 +242,8 @@ def _add_stream(container: Any, width: int, height: int, fps: float, options: Re
     coder = stream.codec_context
     coder.time_base, coder.gop_size, coder.max_b_frames = Fraction(1, TICKS_PER_S), 30, 0
     coder.thread_count = 1
-    coder.colorspace, coder.color_range = 6, 1
-    coder.color_primaries, coder.color_trc = 6, 6
+    coder.colorspace, coder.color_range = BT601, 1
+    coder.color_primaries, coder.color_trc = BT601, BT601
     stream.options = {"preset": "veryfast", "profile": "baseline", "x264-params": "scenecut=0:keyint=30:min-keyint=30"}
     if options.crf is None:
         stream.bit_rate = int(options.bits_per_px * width * height * fps)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.recounting import counted_from
 from virest.camera.response import ResponseCurve
+from virest.capture.join import TICKS_PER_S
 from virest.capture.records import IMU_GAP, NO_IMU, NO_STAMP, Capture, Frame
 from virest.errors import CaptureError, SettingsError
 from virest.simulation.auto_exposure import NOMINAL_ISO, Exposures
@@ -26,7 +27,7 @@ from virest.simulation.hidden import NOTHING, Hidden, focal_changes, focal_scale
 from virest.simulation.recorded_motion import recorded_motion
 from virest.simulation.scenes import MAX_CHART_PX, Scene
 from virest.simulation.sensor import sensor_light
-from virest.simulation.session import TICKS_PER_S, ImuLog, Session, SessionSettings, shown_captures
+from virest.simulation.session import ImuLog, Session, SessionSettings, shown_captures
 
 Array = NDArray[np.float64]
 

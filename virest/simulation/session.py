@@ -19,6 +19,7 @@ from virest.camera.profile import ANDROID_R_CAM_IMU, LANDSCAPE_R_CAM_IMU, Camera
 from virest.camera.profile_file import require_usable
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
+from virest.capture.join import TICKS_PER_S
 from virest.errors import SettingsError
 from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposures
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
@@ -35,8 +36,6 @@ Picture = NDArray[np.uint8]
 
 GRAVITY_WORLD_M_S2 = np.array([0.0, 9.81, 0.0])
 """World y points down."""
-TICKS_PER_S = 90_000
-"""Time base of the movie; timestamps are its ticks, truncated to microseconds."""
 STAMP_FRACTION = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}
 """Position of the timestamp within the exposure."""
 DEFAULT_SWAY_M = 0.012
@@ -139,6 +138,15 @@ class Session:
         """Middle of the frame: start of the first row + half the readout + half the exposure."""
         half = 0.5 * (self.true.shutter.readout_time_s + self.true_exposure_s(capture))
         return self.first_row_start_s(capture) + half
+
+    def blur_px(self) -> float:
+        """Median over the frames of the image motion at the centre during one exposure, in pixels."""
+        lens, captures = self.true.intrinsics, self.shows.tolist()
+        assert lens is not None
+        begin = np.array([self.first_row_start_s(k) for k in captures]) + 0.5 * self.true.shutter.readout_time_s
+        lasting = np.array([self.true_exposure_s(k) for k in captures])
+        turn = self.motion.rotation(begin).inv() * self.motion.rotation(begin + lasting)
+        return round(lens.fx_px * float(np.median(np.linalg.norm(turn.as_rotvec()[:, :2], axis=1))), 2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,7 @@ from virest.app.machine import one_thread_each
 from virest.restoration.settings import REFERENCES
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
+"""camera.shutter.READOUT_DIRECTIONS, here without loading NumPy."""
 LIKE_OPTIONS = (
     "out",
     "like",
