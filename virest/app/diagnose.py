@@ -21,6 +21,7 @@ from virest.app.recreate import restored_scene
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.join import consecutive_runs
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, MovieIndex, probe_movie, read_frames
 from virest.diagnosis.findings import CONSISTENT, Diagnosis, FieldFinding, Finding, Rung
@@ -90,7 +91,7 @@ class RgbReader:
 
     def __call__(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture | None]]:
         """Stream (movie index, RGB (h, w, 3) or None), ascending."""
-        for first, last in _runs(numbers):
+        for first, last in consecutive_runs(numbers):
             yield from read_frames(self.movie, self.index, first, last)
 
 
@@ -193,15 +194,6 @@ def open_source(path: Path, config: Path | None = None) -> Source:
     log.info("%s: camera profile from %s", capture.name, origin)
     index = probe_movie(capture.movie)
     return Source(capture, profile, RgbReader(capture.movie, index), GrayReader(capture.movie, index))
-
-
-def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """First and last of each run of consecutive numbers, ascending."""
-    if not len(numbers):
-        return []
-    ascending = np.unique(np.asarray(numbers))
-    parts = np.split(ascending, np.flatnonzero(np.diff(ascending) > 1) + 1)
-    return [(int(part[0]), int(part[-1])) for part in parts]
 
 
 # ── diagnosis.json ───────────────────────────────────────────────────────────────────────────────────────────────

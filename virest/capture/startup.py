@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.capture.join import consecutive_runs
+
 LOOK_S = 2.0
 """In every capture examined the queue was empty by then."""
 REPEAT_MAX_DIFFERENCE = 0.6
@@ -125,9 +127,7 @@ def find_stalls(
         steady = float(np.nanpercentile(unix_lag_s[first:], 50))
         above = np.flatnonzero(unix_lag_s[first:] > steady + 2 * period_s)
         late |= {first + int(k) for k in above} if len(above) < MOST_STALLED * (len(unix_lag_s) - first) else set()
-    numbers = np.array(sorted(late), int)
-    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(numbers) else []
-    return tuple((int(run[0]), int(run[-1])) for run in runs)
+    return tuple(consecutive_runs(late))
 
 
 def judge_startup(

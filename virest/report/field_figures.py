@@ -9,14 +9,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.camera.field import UNITS, Field
 from virest.diagnosis.findings import FieldFinding
-from virest.report.figures import as_file, canvas, literal
+from virest.report.figures import COVARIATES, as_file, canvas, equal_bins, literal
 
-Array = NDArray[np.float64]
-SAMPLES, ARROWS, BINS, MIN_IN_BIN = 200, 13, 20, 8
+SAMPLES, CELLS, ARROWS = 200, 60, 13
+"""Points of a drawn curve, cells of a map and arrows along one side: fine enough at the printed size."""
 UNIT_SCALES = {
     "delay": (1e3, "ms"),
     "displacement": (1.0, "px"),
@@ -43,7 +42,6 @@ RESIDUALS_OVER = {
     "focal": "time",
     "acceleration": "time",
 }
-RESIDUAL_AXES = {"row": "fraction of the readout", "time": "time, s", "rate": "rate, rad/s", "radius": "radius, px"}
 COMPONENTS = ("x", "y", "z")
 
 
@@ -97,7 +95,7 @@ def _draw_values(axes: Any, fields: tuple[Field, ...]) -> None:
 def _draw_pair(figure: Any, axes: Any, field: Field) -> None:
     """The largest component over two covariates, the second along x."""
     factor, unit = UNIT_SCALES[field.kind]
-    fine = [np.linspace(k[0], k[-1], 60) for k in field.knots]
+    fine = [np.linspace(k[0], k[-1], CELLS) for k in field.knots]
     values = factor * field.at(*np.meshgrid(*fine, indexing="ij"))
     values = values[..., int(np.argmax(np.abs(values).max(axis=(0, 1))))]
     most = float(np.abs(values).max())
@@ -120,17 +118,14 @@ def _named(covariate: str) -> str:
 
 def _draw_arrows(figure: Any, axes: Any, field: Field) -> None:
     """Arrows over the frame, on a map of the displacement's length."""
-    fine = [np.linspace(k[0], k[-1], 60) for k in field.knots]
+    fine = [np.linspace(k[0], k[-1], CELLS) for k in field.knots]
     length = np.linalg.norm(field.at(*np.meshgrid(*fine)), axis=-1)
     shown = axes.pcolormesh(*fine, length, cmap="viridis", shading="auto", rasterized=True)
     figure.colorbar(shown, ax=axes, label="displacement, px", shrink=0.8)
     x, y = np.meshgrid(*(np.linspace(k[0], k[-1], ARROWS) for k in field.knots))
     values = field.at(x, y)
     axes.quiver(x, y, values[..., 0], values[..., 1], color="white", angles="xy")
-    axes.invert_yaxis()
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, px")
-    axes.set_ylabel("y, px")
+    _as_picture(axes)
     if field.std:
         typical = float(np.sqrt(np.mean(np.square(field.std)) * 2))
         axes.set_title(f"vector map; standard deviation {typical:.2g} px", fontsize=10)
@@ -138,18 +133,23 @@ def _draw_arrows(figure: Any, axes: Any, field: Field) -> None:
 
 def _draw_map(figure: Any, axes: Any, field: Field) -> None:
     """Relative change of brightness over the frame, in %."""
-    fine = [np.linspace(k[0], k[-1], 60) for k in field.knots]
+    fine = [np.linspace(k[0], k[-1], CELLS) for k in field.knots]
     values = 100 * field.at(*np.meshgrid(*fine))[..., 0]
     most = float(np.abs(values).max())
     shown = axes.pcolormesh(*fine, values, cmap="RdBu_r", vmin=-most, vmax=most, shading="auto", rasterized=True)
     figure.colorbar(shown, ax=axes, label="light, %", shrink=0.8)
+    _as_picture(axes)
+    if field.std:
+        typical = 100 * float(np.sqrt(np.mean(np.square(field.std))))
+        axes.set_title(f"map; standard deviation {typical:.2g} %", fontsize=10)
+
+
+def _as_picture(axes: Any) -> None:
+    """Axes in pixels of the frame, y downwards."""
     axes.invert_yaxis()
     axes.set_aspect("equal")
     axes.set_xlabel("x, px")
     axes.set_ylabel("y, px")
-    if field.std:
-        typical = 100 * float(np.sqrt(np.mean(np.square(field.std))))
-        axes.set_title(f"map; standard deviation {typical:.2g} %", fontsize=10)
 
 
 def _draw_residuals(axes: Any, along: str, sets: Mapping[str, Mapping[str, Any] | None]) -> None:
@@ -158,17 +158,15 @@ def _draw_residuals(axes: Any, along: str, sets: Mapping[str, Mapping[str, Any] 
         if not data or along not in data:
             continue
         x, y, covariate = (np.asarray(data[name], float) for name in ("x_px", "y_px", along))
-        known = np.isfinite(x) & np.isfinite(y) & np.isfinite(covariate)
-        x, y, covariate = x[known], y[known], covariate[known]
-        if len(x) < MIN_IN_BIN:
+        shares = equal_bins(covariate, np.isfinite(x) & np.isfinite(y) & np.isfinite(covariate))
+        if not shares:
             continue
-        shares = np.array_split(np.argsort(covariate, kind="stable"), min(BINS, len(x) // MIN_IN_BIN))
         middle = [float(np.median(covariate[share])) for share in shares]
         rms = [float(np.sqrt(np.mean(x[share] ** 2 + y[share] ** 2) / 2)) for share in shares]
         axes.plot(middle, rms, marker=".", lw=1.6, color=colours[label], label=label)
     axes.set_ylim(0, 1.18 * axes.get_ylim()[1])
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="upper right", ncols=2, fontsize=8)
-    axes.set_xlabel(RESIDUAL_AXES[along])
+    axes.set_xlabel(COVARIATES[along])
     axes.set_ylabel("rms of tracked − predicted points, px")
     axes.set_title("residuals of the whole model, before and after", fontsize=10)

@@ -22,6 +22,7 @@ COVARIATES = {"row": "fraction of the readout", "time": "time, s", "radius": "ra
 """Covariates of residual plots, with axis labels."""
 RESIDUALS = ("x_px", "y_px")
 BINS, MIN_IN_BIN = 24, 8
+"""Most bins of a plot over a covariate, and fewest points of a bin: the median of eight is known to 0.4 σ."""
 LEAST_BARS = 3
 """A rung with fewer candidates is drawn with room for this many."""
 MOST_DEVIATIONS, DEVIATION_BARS = 4.0, 16
@@ -226,13 +227,19 @@ def _draw_rung(axes: Any, rung: RungBars, most: int, name: str) -> None:
         axes.set_title(literal(name), fontsize=10, pad=18)
 
 
+def equal_bins(along: Array, known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Indices of the known points in bins of equal count along the covariate; empty with too few points for a bin."""
+    numbers = np.flatnonzero(known)
+    if len(numbers) < MIN_IN_BIN:
+        return []
+    order = numbers[np.argsort(along[numbers], kind="stable")]
+    return np.array_split(order, min(BINS, len(order) // MIN_IN_BIN))
+
+
 def _draw_binned(axes: Any, along: Array, residual: Array, colour: str) -> None:
-    known = np.isfinite(along) & np.isfinite(residual)
-    along, residual = along[known], residual[known]
-    if len(along) < MIN_IN_BIN:
+    shares = equal_bins(along, np.isfinite(along) & np.isfinite(residual))
+    if not shares:
         return
-    order = np.argsort(along, kind="stable")
-    shares = np.array_split(order, min(BINS, len(order) // MIN_IN_BIN))
     middle = [float(np.median(along[share])) for share in shares]
     low, centre, high = (np.array([np.percentile(residual[share], q) for share in shares]) for q in (16, 50, 84))
     axes.fill_between(middle, low, high, color=colour, alpha=0.2, lw=0)

@@ -21,6 +21,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from virest.capture.join import consecutive_runs
 from virest.report.charts import ArrowField, Chart, Stretch, arrow_field, band, time_chart
 from virest.report.words import (
     Mapped,
@@ -431,11 +432,7 @@ def left_alone(frames: Sequence[FrameFacts]) -> list[Reason]:
 
 def ranges(numbers: Sequence[int]) -> str:
     """Numbers as ranges: ``3–9, 12``."""
-    if not len(numbers):
-        return ""
-    ascending = np.unique(np.asarray(numbers))
-    runs = np.split(ascending, np.flatnonzero(np.diff(ascending) > 1) + 1)
-    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
+    return ", ".join(f"{first}" if first == last else f"{first}–{last}" for first, last in consecutive_runs(numbers))
 
 
 def _is_first(name: str) -> bool:
