@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from virest import __version__
+from virest.app.cli.options import ARGUMENTS, OPTIONS, option_groups
 
 EXIT_CODES = (
     (0, "done"),
@@ -64,13 +65,8 @@ def _paragraphs(text: str) -> Iterator[str]:
 
 def _options(command: Any, context: Any) -> Iterator[str]:
     """Arguments and options, then each group in the order of ``--help`` under its title."""
-    groups: dict[str, list[tuple[str, str]]] = {"": []}
-    for parameter in command.get_params(context):
-        record = parameter.get_help_record(context)
-        if record is not None:
-            groups.setdefault(getattr(parameter, "rich_help_panel", None) or "", []).append(record)
-    for title, records in groups.items():
-        yield from (".PP", f".I {_text(title)}") if title else ()
+    for title, records in option_groups(command, context).items():
+        yield from (".PP", f".I {_text(title)}") if title not in (ARGUMENTS, OPTIONS) else ()
         for names, meaning in records:
             yield from (".TP", f".B {_text(names)}", _text(meaning))
 

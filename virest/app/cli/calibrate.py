@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from virest.app import console
-from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts
+from virest.app.cli.options import Config, Json, OneCapture, Quiet, Verbose, Version, emit_facts, one_capture
 from virest.app.machine import cores, one_thread_each
 
 CALIBRATED_EXTRAS = (
@@ -23,7 +23,7 @@ CALIBRATED_EXTRAS = (
 
 
 def calibrate(
-    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its path from stdin.")],
+    capture: OneCapture,
     config: Config = None,
     extra: Annotated[
         list[str] | None,
@@ -66,10 +66,8 @@ def calibrate(
     names = _parse_extras(extra or [])
     output = CalibrationOutput(out, kalibr, overwrite)
     output.require()
-    paths = console.expand_dash([capture])
-    if len(paths) != 1:
-        raise typer.BadParameter(f"standard input lists {len(paths)} captures; calibrate takes one")
-    plan = plan_calibration(Path(paths[0]), config, names)
+    path = one_capture(capture, "calibrate")
+    plan = plan_calibration(Path(path), config, names)
     with process_map(cores()) as each, console.progress_bar(plan.steps, "calibrate", quiet=quiet) as bar:
         facts, text = run_calibration(plan, output, bar.update if bar else None, each)
     emit_facts(facts, text, as_json=json, quiet=quiet)

@@ -8,13 +8,25 @@ from typing import Annotated
 import typer
 
 from virest.app import console
-from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts, one_of, parse_frames
+from virest.app.cli.options import (
+    Config,
+    Frames,
+    Json,
+    OneCapture,
+    Quiet,
+    Verbose,
+    Version,
+    emit_facts,
+    one_capture,
+    one_of,
+    parse_frames,
+)
 
 FORMATS, STAMPS = ("euroc", "tum", "nerfstudio", "colmap", "gyroflow"), ("logged", "instant")
 
 
 def export(
-    capture: Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its path from stdin.")],
+    capture: OneCapture,
     format: Annotated[
         str, typer.Option("--format", metavar="NAME", callback=one_of(FORMATS), help=f"Format: {', '.join(FORMATS)}.")
     ] = "euroc",
@@ -26,10 +38,7 @@ def export(
         typer.Option("--restored", metavar="RUN_DIR", help="Export the frames of this finished process run."),
     ] = None,
     config: Config = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices."),
-    ] = None,
+    frames: Frames = None,
     stamps: Annotated[
         str,
         typer.Option(
@@ -58,13 +67,11 @@ def export(
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
     chosen = parse_frames(frames)
-    paths = console.expand_dash([capture])
-    if len(paths) != 1:
-        raise typer.BadParameter(f"standard input lists {len(paths)} captures; export takes one")
+    path = one_capture(capture, "export")
     from virest.app.export import ExportOptions, plan_export, run_export
 
     options = ExportOptions(out, format, restored, config, chosen, stamps, overwrite, poses)
-    plan = plan_export(paths[0], options)
+    plan = plan_export(path, options)
     with console.progress_bar(len(plan.frames), plan.capture.name, quiet=quiet) as bar:
         facts, text = run_export(plan, bar.update if bar else None)
     emit_facts(facts, text, as_json=json, quiet=quiet)

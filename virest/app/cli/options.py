@@ -16,6 +16,8 @@ from virest.app import console
 
 log = logging.getLogger(__name__)
 
+ARGUMENTS, OPTIONS = "Arguments", "Options"
+"""Titles of a command's help without groups of its own."""
 MOST_NEIGHBOURS = 8
 """Frames on each side: farther away even a capture at 30 frames/s shows a different scene."""
 
@@ -43,19 +45,23 @@ class GroupedCommand(typer.core.TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Arguments, options, then each group in the order in which its first option is declared."""
-        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record is None:
-                continue
-            usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
+        for title, records in option_groups(self, ctx).items():
+            with formatter.section(title):
+                formatter.write_dl(records)
+
+
+def option_groups(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
+    """Help records (names, meaning) by title: ARGUMENTS, OPTIONS, then each group as first declared; none is empty."""
+    groups: dict[str, list[tuple[str, str]]] = {ARGUMENTS: [], OPTIONS: []}
+    for parameter in command.get_params(ctx):
+        record = parameter.get_help_record(ctx)
+        if record is not None:
+            usual = ARGUMENTS if parameter.param_type_name == "argument" else OPTIONS
             groups.setdefault(getattr(parameter, "rich_help_panel", None) or usual, []).append(record)
-        for title, records in groups.items():
-            if records:
-                with formatter.section(title):
-                    formatter.write_dl(records)
+    return {title: records for title, records in groups.items() if records}
 
 
+OneCapture = Annotated[str, typer.Argument(metavar="CAPTURE", help="Capture folder; - reads its path from stdin.")]
 Captures = Annotated[
     list[str],
     typer.Argument(metavar="CAPTURE", help="Capture folders, or the movies in them; - reads their paths from stdin."),
@@ -67,6 +73,12 @@ Version = Annotated[
     bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=show_version)
 ]
 Config = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="Camera profile, or a Kalibr camchain.")]
+
+
+Frames = Annotated[
+    str | None,
+    typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices."),
+]
 
 
 def parse_frames(text: str | None) -> slice:
@@ -92,6 +104,14 @@ def capture_paths(captures: list[str]) -> list[str]:
     if not paths:
         log.warning("no capture: standard input is empty")
     return paths
+
+
+def one_capture(capture: str, command: str) -> str:
+    """The path of the one capture a command takes, read from standard input for `-`."""
+    paths = console.expand_dash([capture])
+    if len(paths) != 1:
+        raise typer.BadParameter(f"standard input lists {len(paths)} captures; {command} takes one")
+    return paths[0]
 
 
 def parse_neighbours(text: str | None) -> int | None:

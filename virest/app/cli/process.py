@@ -14,6 +14,7 @@ from virest.app import console
 from virest.app.cli.options import (
     Captures,
     Config,
+    Frames,
     Json,
     Quiet,
     Verbose,
@@ -37,10 +38,7 @@ def process(
     settings: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings file, such as configs/balanced.yaml.")
     ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(metavar="A:B[:STEP]", help="Only these frames: a Python slice of the movie's frame indices."),
-    ] = None,
+    frames: Frames = None,
     preset: Annotated[
         str | None,
         typer.Option(metavar="|".join(PRESETS), callback=one_of(tuple(PRESETS)), help="Quality or speed. [balanced]"),
