@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from virest.app.console import table
-from virest.app.outputs import write_whole
+from virest.app.outputs import require_file, write_whole
 from virest.calibration.bracket_samples import BracketPicture
 from virest.calibration.response_curve import CurveFit, fit_response
 from virest.camera.profile_file import response_block
@@ -17,7 +17,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.detect import is_capture
 from virest.capture.folder import read_capture
 from virest.capture.stills import Still, capture_bracket, read_bracket
-from virest.errors import CaptureError, OutputError, SettingsError, printable
+from virest.errors import CaptureError, SettingsError, printable
 from virest.report.figures import FORMATS, response_figure
 
 log = logging.getLogger(__name__)
@@ -40,8 +40,9 @@ def calibrate_curve(
     out: YAML with the ``response:`` block; plot: figure, its format by its suffix.  Raises CaptureError,
     CalibrationError, OutputError; nothing is written then.
     """
-    for path in (out, plot):
-        _require_writable(path, overwrite=overwrite)
+    for option, path in (("--out", out), ("--plot", plot)):
+        if path:
+            require_file(path, overwrite=overwrite, option=option)
     stills, notes = read_source(source, exposures)
     fit = fit_response([BracketPicture(s.file, s.levels, s.exposure) for s in stills], kind)
     facts = as_json(fit, stills, notes)
@@ -51,17 +52,6 @@ def calibrate_curve(
     if plot:
         write_whole(plot, figure)
     return facts, describe(facts, out, plot)
-
-
-def _require_writable(path: Path | None, *, overwrite: bool) -> None:
-    if path is None:
-        return
-    if path.is_dir():
-        raise OutputError(f"{path}: is a folder", hint="name a file")
-    if not path.absolute().parent.is_dir():
-        raise OutputError(f"{path}: its folder does not exist", hint="create it first")
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists already", hint="name another file, or pass --overwrite")
 
 
 def plot_format_known(path: Path) -> bool:

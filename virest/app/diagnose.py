@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,8 +17,10 @@ from virest.app.diagnosis_text import SHOWN_COMPONENTS, describe
 from virest.app.field_record import field_record
 from virest.app.outputs import capture_name, json_text, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
+from virest.app.run_folder import DIAGNOSIS, EXTENDED, FIGURE, FIGURES
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import format_profile, profile_mapping
+from virest.camera.yaml_mapping import commented
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.join import consecutive_runs
 from virest.capture.records import Capture
@@ -49,8 +50,6 @@ Progress = Callable[[str, float], None]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
 SCHEMA = "virest/diagnosis/1"
-DIAGNOSIS, EXTENDED, FIGURES = "diagnosis.json", "extended.yaml", "figures"
-OWN_FIGURES = re.compile(r"(pictures|residuals|ladder|field_\d\d|\d\d_[a-z_]+)\.png")
 NOT_CONSISTENT = 10
 LADDER_PART, GAIN_PART = 0.85, 0.95
 """Progress, from 0 to 1, at which the ladder and the restorations end."""
@@ -201,18 +200,10 @@ def open_source(path: Path, config: Path | None = None) -> Source:
 
 def as_json(found: Diagnosis, gain: RestorationGain, figures: Sequence[Sequence[str]]) -> Json:
     """The content of diagnosis.json; figures: paths for each cause, relative to the file."""
-    nominal = found.nominal
     content = {
         "schema": SCHEMA,
         "verdict": found.verdict,
-        "nominal": {
-            "geometry_rms_px": nominal.geometry_rms_px,
-            "geometry_noise_px": nominal.geometry_noise_px,
-            "photometric_rms": nominal.photometric_rms,
-            "blur_rms_px": nominal.blur_rms_px,
-            "tracks": nominal.tracks,
-            "frames": nominal.frames,
-        },
+        "nominal": dataclasses.asdict(found.nominal),
         "causes": [_cause(cause, paths) for cause, paths in zip(found.causes, figures, strict=True)],
         "fields": [_field(field, number) for number, field in enumerate(found.fields, start=1)],
         "unexplained": {
@@ -240,7 +231,7 @@ def _cause(cause: Finding, figures: Sequence[str]) -> Json:
             "after": held_out.after,
             "gain": held_out.gain,
         },
-        "rivals": [{"name": rival.name, "held_out_after": rival.held_out_after} for rival in cause.rivals],
+        "rivals": [dataclasses.asdict(rival) for rival in cause.rivals],
         "p_value": cause.p_value,
         "sentence": cause.sentence,
         "figures": list(figures),
@@ -275,7 +266,7 @@ def extended_text(name: str, found: Diagnosis) -> str:
     fields = [f"{field.kind} over {', '.join(field.covariates)}" for field in found.fields]
     names = ", ".join([*(cause.name for cause in found.causes), *fields]) or "nothing to add"
     head = f"Camera profile by virest diagnose, from {name}: {found.verdict}: {names}"
-    return f"# {' '.join(head.split())}\n{format_profile(profile)}"
+    return commented([head]) + format_profile(profile)
 
 
 def _plain_std(std: Any) -> Any:
@@ -387,7 +378,7 @@ def _write_all(folder: Path, files: dict[str, bytes]) -> None:
         for name, data in files.items():
             write_whole(folder / name, data)
         for old in (folder / FIGURES).iterdir():
-            if OWN_FIGURES.fullmatch(old.name) and f"{FIGURES}/{old.name}" not in files:
+            if FIGURE.fullmatch(old.name) and f"{FIGURES}/{old.name}" not in files:
                 old.unlink()
     except BaseException as error:
         with suppress(OSError):

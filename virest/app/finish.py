@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.film import display_matrix, side_by_side, write_film
-from virest.app.outputs import write_picture
+from virest.app.outputs import require_file, write_picture
 from virest.app.run_folder import RunFolder, parse_lines
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
@@ -99,14 +99,8 @@ def require_finishable(options: FinishOptions, name: str, run: Path, *, overwrit
     if options.any and is_remote(run):
         raise OutputError("--video and --crop need a local --out", hint="process to a folder, then upload")
     film = options.film_of(name)
-    if film is None:
-        return
-    if film.is_dir() or not film.absolute().parent.is_dir():
-        raise OutputError(
-            f"{film}: is a folder, or its folder does not exist", hint="name a file in a folder that exists"
-        )
-    if film.exists() and not overwrite:
-        raise OutputError(f"{film}: exists already", hint="name another by --video, or pass --overwrite")
+    if film is not None:
+        require_file(film, overwrite=overwrite, option="--video")
 
 
 def finish_pictures(

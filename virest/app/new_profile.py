@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from virest.app.console import table
-from virest.app.outputs import write_whole
+from virest.app.outputs import require_file, write_whole
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.phones import READOUTS, Readout, find_readouts
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import format_profile, profile_mapping
 from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.pictures import MAX_SIDE_PX
 from virest.capture.profile_source import phone_profile
-from virest.errors import OutputError, SettingsError
+from virest.errors import SettingsError
 
 Json = dict[str, Any]
 COMMENTS = {
@@ -47,8 +48,7 @@ class NewProfile:
 
 def run_new_profile(request: NewProfile) -> tuple[Json, str]:
     """Write the profile; returns the mapping for ``--json`` and the printed text."""
-    if request.out.exists() and not request.overwrite:
-        raise OutputError(f"{request.out}: exists already", hint="name another by --out, or pass --overwrite")
+    require_file(request.out, overwrite=request.overwrite)
     profile, source = _base(request)
     notes = [f"base: {source}"]
     if (focal := _focal_px(request, profile)) is not None:
@@ -91,13 +91,7 @@ def commented(profile: CameraProfile, notes: list[str]) -> str:
 def known_devices(text: str) -> tuple[Json, str]:
     """Entries of the table of readout times whose device matches."""
     entries = find_readouts(text) if text else READOUTS
-    facts = {
-        "devices": [
-            {"device": e.device, "width": e.width, "height": e.height, "frame_rate_hz": e.frame_rate_hz,
-             "readout_s": e.readout_s, "std_s": e.std_s, "source": e.source}
-            for e in entries
-        ]
-    }  # fmt: skip
+    facts = {"devices": [asdict(entry) for entry in entries]}
     if not entries:
         return facts, f"no device matches {text!r}; virest calibrate measures a readout time from a capture"
     rows = [
@@ -114,9 +108,10 @@ def _ms(seconds: float | None, digits: int) -> str:
 def parse_size(text: str) -> tuple[int, int]:
     """Width and height of ``WxH``."""
     found = re.fullmatch(r"\s*(\d{1,5})\s*[x×]\s*(\d{1,5})\s*", text)
-    if not found or not 0 < int(found[1]) <= 16384 or not 0 < int(found[2]) <= 16384:
+    width, height = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         raise SettingsError(f"size {text!r} is not WxH", hint="write 1920x1080, as stored in the movie")
-    return int(found[1]), int(found[2])
+    return width, height
 
 
 def _base(request: NewProfile) -> tuple[CameraProfile, str]:

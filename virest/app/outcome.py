@@ -8,6 +8,7 @@ from pathlib import Path
 
 from virest.app import console
 from virest.app.account import STATUSES
+from virest.app.run_folder import EXTENDED
 from virest.errors import PARTLY_FAILED
 
 NUMBERS = (*STATUSES, "frames/s")
@@ -60,7 +61,7 @@ def next_steps(outcomes: list[CaptureOutcome]) -> list[str]:
         return [f"next: virest report {shlex.quote(str(outcomes[0].folder.parent))} shows them all"]
     only = outcomes[0]
     path, folder = shlex.quote(only.path), shlex.quote(str(only.folder))
-    extended = only.folder / "extended.yaml"
+    extended = only.folder / EXTENDED
     if only.advice:
         return [f"next: {only.advice.replace('CAPTURE', path)}"]
     if extended.is_file():

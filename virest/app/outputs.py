@@ -68,6 +68,16 @@ def _write_bytes(path: Path, data: bytes) -> None:
         file.write(data)
 
 
+def require_file(path: Path, *, overwrite: bool, option: str = "--out") -> None:
+    """Raise OutputError, before any work, if a file could not be written there; option: the one that chose it."""
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder", hint=f"{option} takes a file")
+    if not path.absolute().parent.is_dir():
+        raise OutputError(f"{path}: its folder does not exist", hint=f"create it, or choose another path by {option}")
+    if (path.exists() or path.is_symlink()) and not overwrite:
+        raise OutputError(f"{path}: exists already", hint=f"name another by {option}, or pass --overwrite")
+
+
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     """Write an RGB picture as PNG."""
     try:

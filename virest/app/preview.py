@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app import api
-from virest.app.outputs import write_whole
+from virest.app.outputs import require_file, write_whole
 from virest.capture.folder import Frame
-from virest.errors import CaptureError, OutputError
+from virest.errors import CaptureError
 from virest.image_formation.row_clock import RowClock
 from virest.report.concepts import preview_figure
 from virest.restoration.frame import RestoredFrame
@@ -39,8 +39,7 @@ def run_preview(path: str, options: PreviewOptions) -> tuple[Json, str]:
     """Restore one frame and write the picture; returns the mapping for ``--json`` and the printed text."""
     capture = api.open(path, options.config)
     out = options.out or Path(f"{capture.name}-preview.png")
-    if out.exists() and not options.overwrite:
-        raise OutputError(f"{out}: exists already", hint="name another by --out, or pass --overwrite")
+    require_file(out, overwrite=options.overwrite)
     number = most_blurred(capture) if options.frame is None else options.frame
     restored = capture.restore(number, options.preset)
     found = restored.degradation

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app.account import STATUSES
-from virest.app.outputs import file_facts, write_whole
+from virest.app.outputs import file_facts, require_file, write_whole
 from virest.app.report_files import (
     Account,
     DiagnosisFile,
@@ -33,10 +32,10 @@ from virest.app.report_files import (
     read_model,
     read_tiles,
 )
-from virest.app.run_folder import RunFolder
+from virest.app.run_folder import DIAGNOSIS, EXTENDED, FIGURE, FIGURES, REPORT, RunFolder
 from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.video import MovieIndex, probe_movie, read_frames
-from virest.errors import PARTLY_FAILED, CaptureError, OutputError, VirestError
+from virest.errors import PARTLY_FAILED, CaptureError, VirestError
 from virest.report.html import (
     CaptureRecord,
     DiagnosisRecord,
@@ -53,10 +52,7 @@ from virest.report.html import (
 
 log = logging.getLogger(__name__)
 
-REPORT = "report.html"
-RUN, DIAGNOSIS, EXTENDED, FIGURES = "run.json", "diagnosis.json", "extended.yaml", "figures"
-FIGURE = re.compile(r"(pictures|residuals|ladder|field_\d\d|\d\d_[a-z_]+)\.png")
-"""File names of `diagnose`'s figures; no other file is read, whatever diagnosis.json names."""
+RUN = "run.json"
 FRAMES_SHOWN, MOST_FRAMES = 6, 24
 """Default numbers of frames shown: of one capture, and of all captures of a page together."""
 PICTURE_BYTES = 4_200_000
@@ -109,7 +105,7 @@ def write_report(run_dir: Path, options: ReportOptions) -> ReportOutcome:
     """
     target = options.out or run_dir / REPORT
     _require_dir(run_dir)
-    _require_target(target, options.overwrite)
+    require_file(target, overwrite=options.overwrite)
     folders = find_folders(run_dir)
     records, failures = [], []
     for folder in folders:
@@ -136,16 +132,6 @@ def _require_dir(run_dir: Path) -> None:
     if not found:
         what = "is not a folder" if run_dir.exists() else "no such folder"
         raise CaptureError(f"{run_dir}: {what}", hint="pass OUT/<capture> of a run, or OUT itself")
-
-
-def _require_target(target: Path, overwrite: bool) -> None:
-    """Raise OutputError, before any work, if the page cannot be written there."""
-    if target.is_dir():
-        raise OutputError(f"{target}: is a folder", hint="--out takes a file")
-    if not target.parent.is_dir():
-        raise OutputError(f"{target.parent}: no such folder", hint="create it, or choose another path with --out")
-    if (target.exists() or target.is_symlink()) and not overwrite:
-        raise OutputError(f"{target}: exists already", hint="--overwrite replaces it, --out chooses another path")
 
 
 def find_folders(run_dir: Path) -> list[Path]:

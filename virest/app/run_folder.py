@@ -37,8 +37,11 @@ except ImportError:  # Windows
 
 OWN_FILES = re.compile(r"(parameters\.jsonl|run\.json|\.run|\d{6,}\.png|\d+-\d+\.jsonl)(\.[0-9a-f]{8}\.part)?")
 PART = re.compile(r".*\.[0-9a-f]{8}\.part")
-BESIDE = ("diagnosis.json", "extended.yaml", "figures", "report.html")
-"""Files of `diagnose` in the same folder: they do not belong to a run and do not block one."""
+DIAGNOSIS, EXTENDED, FIGURES, REPORT = "diagnosis.json", "extended.yaml", "figures", "report.html"
+BESIDE = (DIAGNOSIS, EXTENDED, FIGURES, REPORT)
+"""Files of `diagnose` and `report` in the same folder: they do not belong to a run and do not block one."""
+FIGURE = re.compile(r"(pictures|residuals|ladder|field_\d\d|\d\d_[a-z_]+)\.png")
+"""Names of `diagnose`'s figures; no other file in FIGURES is read or removed."""
 REQUEST_KEYS = ("version", "settings", "frames", "profile_sha256", "inputs", "outputs")
 
 Mode = Literal["new", "resume", "overwrite"]
