@@ -25,6 +25,7 @@ from virest.evaluation.burst import BURSTS, REACHES, align_frames
 from virest.evaluation.fidelity import (
     MARGIN_PX,
     fidelity,
+    grey_levels,
     inner_part,
     mean_squared_error,
     psnr_of,
@@ -292,7 +293,7 @@ def _aligned(picture: Picture, truth: Picture) -> tuple[Picture, NDArray[np.floa
 
 def _whole_shift(picture: Picture, truth: Picture) -> NDArray[np.float64]:
     """Shift (x, y) of the picture against its reference in whole pixels; 0 if aligning does not reduce the error."""
-    grey = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in (truth, picture)]
+    grey = [grey_levels(p).astype(np.float32) for p in (truth, picture)]
     window = cv2.createHanningWindow(grey[0].shape[::-1], cv2.CV_32F)
     shift = np.rint(np.array(cv2.phaseCorrelate(grey[0], grey[1], window)[0]))
     if np.abs(shift).max() > min(grey[0].shape) / 4:
@@ -332,7 +333,7 @@ def _facts(results: list[FrameResult], about: dict[str, Any], case: str = CASE) 
         "first": _first(results, methods),
         "results": [
             {"capture": r.capture, "frame": r.frame, "method": r.method, "mse": r.mse,
-             "psnr_db": psnr_of(r.mse) if r.mse else "inf",
+             "psnr_db": _finite(psnr_of(r.mse)),
              "ssim": r.ssim, "matches": r.matches, "matches_in_place": r.matches_in_place}
             for r in results
         ],
@@ -347,14 +348,18 @@ def _summary(results: Sequence[FrameResult], methods: Sequence[str]) -> dict[str
         mse = float(np.mean([r.mse for r in own]))
         summary[method] = {
             "mse": mse,
-            "psnr_db": psnr_of(mse) if mse else "inf",
-            "mean_frame_psnr_db": float(np.mean([psnr_of(r.mse) for r in own])) if all(r.mse for r in own) else "inf",
+            "psnr_db": _finite(psnr_of(mse)),
+            "mean_frame_psnr_db": _finite(float(np.mean([psnr_of(r.mse) for r in own]))),
             "ssim": float(np.mean([r.ssim for r in own])),
             "matches": float(np.mean([r.matches for r in own])),
             "matches_in_place": float(np.mean([r.matches_in_place for r in own])),
             "frames": len(own),
         }
     return summary
+
+
+def _finite(psnr_db: float) -> float | str:
+    return psnr_db if np.isfinite(psnr_db) else "inf"
 
 
 def _first(results: Sequence[FrameResult], methods: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +19,7 @@ from virest.errors import CaptureError
 from virest.evaluation.angles import Rectangle, largest_rectangle, neighbour_angles_rad, quadrilateral_angles_rad
 from virest.evaluation.board_scenes import BoardSetting, board_session
 from virest.evaluation.boards import Board, find_board, matched, plane_lattice
-from virest.evaluation.fidelity import fidelity, psnr_of
+from virest.evaluation.fidelity import fidelity, grey_levels, psnr_of
 from virest.evaluation.schubert2018 import fit_velocity, velocity_map
 from virest.image_formation.row_clock import ROW_MIDDLE, RowClock
 from virest.inference.tracking import track_pairs
@@ -202,10 +201,10 @@ def _compare(
     kind: str,
 ) -> tuple[FrameResult, tuple[slice, slice]] | None:
     """Angles and pictures of one frame, and the part of the picture around the board."""
-    board = find_board(_grey(truth), kind)
+    board = find_board(grey_levels(truth), kind)
     if board is None:
         return None
-    lattices = {m: matched(find_board(_grey(picture), board.kind), board) for m, picture in pictures.items()}
+    lattices = {m: matched(find_board(grey_levels(picture), board.kind), board) for m, picture in pictures.items()}
     everywhere = np.asarray(np.isfinite(np.stack([board.points_px, *lattices.values()])).all((0, -1)))
     rectangle = largest_rectangle(everywhere)
     crop = _around(board, valid_px)
@@ -237,10 +236,6 @@ def _around(board: Board, valid_px: Sequence[int]) -> tuple[slice, slice] | None
     left, top = (int(max(v - CROP_MARGIN_PX, low)) for v, low in zip((x0, y0), valid_px[:2], strict=True))
     right, bottom = (int(min(v + CROP_MARGIN_PX, high)) for v, high in zip((x1, y1), valid_px[2:], strict=True))
     return (slice(top, bottom), slice(left, right)) if min(right - left, bottom - top) > 4 * CROP_MARGIN_PX else None
-
-
-def _grey(picture: Picture) -> Picture:
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def difference_sheet(pictures: Mapping[str, Picture], truth: Picture) -> Picture:

@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FORMATS = ("euroc", "tum", "nerfstudio", "colmap", "gyroflow")
 SCENES = ("nerfstudio", "colmap")
-STAMPS = ("logged", "instant")
 RECORD = "export.json"
 PLAIN_PICTURES = ("restored", "copied")
 
@@ -139,31 +137,29 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
     written, instant_s = _written_profile(profile, instants_s, options)
     written = _for_frames(written, frames, capture, options)
     lens, off_px = (None, 0.0) if written.intrinsics is None else standard_lens(written.intrinsics)
-    imu, gyro_rad_s = capture.imu, _corrected_gyro(capture, profile)
+    imu = capture.imu
     of_fields = (ExportNote(text) for text in field_notes(written, off_px))
     notes = (*_notes(capture, profile, options, instants_s), *of_fields)
     for note in notes:
         log.warning("%s: %s", capture.name, note.text)
-    noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
-    times = _imu_time_ns(capture, profile)
     return ExportPlan(
-        target,
-        capture,
-        options,
-        frames,
-        left_out,
-        written,
-        instant_s,
-        times,
-        noise,
-        source,
-        notes,
-        profile,
-        velocities,
-        options.restored is not None and reference == "exposure-start",
-        replace(written, intrinsics=lens).with_fields(()),
-        gyro_rad_s,
-        None if options.poses is None else _read_poses(options.poses),
+        target=target,
+        capture=capture,
+        options=options,
+        frames=frames,
+        left_out=left_out,
+        profile=written,
+        instant_s=instant_s,
+        imu_time_ns=_imu_time_ns(capture, profile),
+        noise=measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2),
+        source=source,
+        notes=notes,
+        camera=profile,
+        velocities=velocities,
+        restored_start=options.restored is not None and reference == "exposure-start",
+        standard=replace(written, intrinsics=lens).with_fields(()),
+        gyro_rad_s=_corrected_gyro(capture, profile),
+        poses=None if options.poses is None else _read_poses(options.poses),
     )
 
 

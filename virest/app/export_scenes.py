@@ -3,8 +3,7 @@
 Poses come from a trajectory file, if given.  Otherwise only orientations are known, from the gyroscope: COLMAP gets
 zero positions, a starting point and not a reconstruction, and nerfstudio gets no poses.
 
-COLMAP and nerfstudio count pixels from the top-left corner of the first one, so cx and cy are half a pixel larger than
-in a camera profile.  nerfstudio's camera axes are OpenGL's: x right, y up, z back.
+nerfstudio's camera axes are OpenGL's: x right, y up, z back.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from virest.app.export_plan import ExportFrame, ExportPlan
 from virest.app.outputs import json_text
+from virest.camera.colmap import HALF_PX, colmap_camera
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
@@ -30,7 +30,6 @@ from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
-HALF_PX = 0.5
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """Rotation between OpenGL's camera axes and ours, in both directions."""
 FIT_ANGLES = 400
@@ -188,7 +187,7 @@ def colmap_files(plan: ExportPlan, poses: list[FramePose]) -> dict[str, str]:
     """The text model ``sparse/0``, and the poses at both ends of the rolling shutter."""
     lens = plan.standard.intrinsics
     assert lens is not None
-    model, parameters = _colmap_camera(lens)
+    model, parameters = colmap_camera(lens)
     camera = f"1 {model} {lens.width} {lens.height} {' '.join(f'{value:.12g}' for value in parameters)}"
     images = []
     for number, pose in enumerate(poses, start=1):
@@ -204,19 +203,6 @@ def colmap_files(plan: ExportPlan, poses: list[FramePose]) -> dict[str, str]:
         "sparse/0/points3D.txt": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n",
         "rolling_shutter.json": _shutter_json(plan, poses),
     }
-
-
-def _colmap_camera(lens: Intrinsics) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's model that holds the lens, and its parameters."""
-    basic = (lens.fx_px, lens.fy_px, lens.cx_px + HALF_PX, lens.cy_px + HALF_PX)
-    if lens.model == "fisheye":
-        return "OPENCV_FISHEYE", (*basic, *lens.coefficients)
-    if not lens.is_distorted:
-        return "PINHOLE", basic
-    k1, k2, p1, p2, k3 = lens.coefficients
-    if k3:
-        return "FULL_OPENCV", (*basic, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-    return "OPENCV", (*basic, k1, k2, p1, p2)
 
 
 def _world_to_camera(rotation_world_cam: Array, position_m: Array | None) -> tuple[list[float], list[float]]:

@@ -25,14 +25,9 @@ def inspect_capture(path: Path) -> tuple[dict[str, Any], str, int]:
         capture = read_capture(path)
     except CaptureError as fault:
         facts = _partial(Path(path), fault)
-        return facts, _describe_facts(facts), fault.exit_code
+        return facts, _describe(facts), fault.exit_code
     facts = as_json(capture)
-    return facts, _describe_facts(facts), 0
-
-
-def describe(capture: Capture) -> str:
-    """The printed table of a capture."""
-    return _describe_facts(as_json(capture))
+    return facts, _describe(facts), 0
 
 
 def as_json(capture: Capture) -> dict[str, Any]:
@@ -40,18 +35,14 @@ def as_json(capture: Capture) -> dict[str, Any]:
     frame_s = np.array([frame.time_s for frame in capture.frames])
     frame_period, imu_period = median_period_s(frame_s), median_period_s(capture.imu.time_s)
     logged = capture.metadata
+    profile_source, profile_notes = _profile_source(capture)
     return {
         "capture": capture.name,
         "folder": str(capture.folder),
         "kind": capture.kind,
         "usable": True,
         "exit_code": 0,
-        "movie": {
-            "width": capture.width,
-            "height": capture.height,
-            "frames": len(capture.frames),
-            "keyframes": len(capture.keyframes),
-        },
+        "movie": _movie(capture.width, capture.height, len(capture.frames), len(capture.keyframes)),
         "counts": {key: value for key, value in capture.counts.items() if DROPPED not in key},
         "dropped": _dropped(capture.counts),
         "frames": _frame_counts(capture.frames),
@@ -78,12 +69,16 @@ def as_json(capture: Capture) -> dict[str, Any]:
         "focal_length_mm": logged.focal_length_mm,
         "accelerometer": capture.imu.has_accelerometer,
         "peak_rate_rad_s": float(np.linalg.norm(capture.imu.gyro_rad_s, axis=1).max()),
-        "profile": _profile_source(capture),
-        "notes": [_note(note) for note in (*capture.notes, *_profile_notes(capture))],
+        "profile": profile_source,
+        "notes": [_note(note) for note in (*capture.notes, *profile_notes)],
     }
 
 
 # ── facts ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _movie(width: int, height: int, frames: int, keyframes: int) -> dict[str, int]:
+    return {"width": width, "height": height, "frames": frames, "keyframes": keyframes}
 
 
 def _frame_counts(frames: tuple[Frame, ...]) -> dict[str, Any]:
@@ -138,19 +133,12 @@ def _skipped(frames: tuple[Frame, ...]) -> list[dict[str, Any]]:
     return runs
 
 
-def _profile_source(capture: Capture) -> str | None:
+def _profile_source(capture: Capture) -> tuple[str | None, list[Note]]:
+    """Where the profile comes from, or a note of why it cannot be used."""
     try:
-        return resolve_profile(capture)[1]
-    except VirestError:
-        return None
-
-
-def _profile_notes(capture: Capture) -> list[Note]:
-    try:
-        resolve_profile(capture)
+        return resolve_profile(capture)[1], []
     except VirestError as fault:
-        return [Note("warning", "profile", str(fault))]
-    return []
+        return None, [Note("warning", "profile", str(fault))]
 
 
 def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
@@ -197,30 +185,24 @@ def _look_at(path: Path, reader: Callable[[Path], Any], facts: dict[str, Any], n
         if path.name != EPOCHS and str(fault) not in [note.text for note in notes]:
             notes.append(Note("error", _code(fault), str(fault)))
         return
-    match path.name:
-        case _ if isinstance(found, MovieIndex):
-            facts["movie"] = {
-                "width": found.width,
-                "height": found.height,
-                "frames": len(found),
-                "keyframes": len(found.keyframes),
-            }
-        case "edge_epochs.txt":
-            applied_ns = (found.mean_difference_ns or 0) if found.source == "UNKNOWN" else 0
-            facts["clock"] = _clock(found.source, applied_ns, found.mean_difference_ns)
-        case _:
-            facts["counts"][f"{path.name} rows"] = found.rows
-            if found.dropped:
-                facts["dropped"][path.name] = dict(found.dropped)
-            if len(found.time_ns):
-                span = [int(found.time_ns[0]) / 1e9, int(found.time_ns[-1]) / 1e9]
-                facts.setdefault("logged_span_s", {})[path.name] = span
+    if isinstance(found, MovieIndex):
+        facts["movie"] = _movie(found.width, found.height, len(found), len(found.keyframes))
+    elif path.name == EPOCHS:
+        applied_ns = (found.mean_difference_ns or 0) if found.source == "UNKNOWN" else 0
+        facts["clock"] = _clock(found.source, applied_ns, found.mean_difference_ns)
+    else:
+        facts["counts"][f"{path.name} rows"] = found.rows
+        if found.dropped:
+            facts["dropped"][path.name] = dict(found.dropped)
+        if len(found.time_ns):
+            span = [int(found.time_ns[0]) / 1e9, int(found.time_ns[-1]) / 1e9]
+            facts.setdefault("logged_span_s", {})[path.name] = span
 
 
 # ── the table ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _describe_facts(facts: dict[str, Any]) -> str:
+def _describe(facts: dict[str, Any]) -> str:
     lines = [f"{facts['capture']}: {'usable' if facts['usable'] else 'NOT usable'}"]
     for title, text in _rows(facts):
         lines.append(f"  {title:<14}{text}")

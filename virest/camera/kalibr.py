@@ -38,6 +38,7 @@ DIFFERENCE_ORDER, DIFFERENCE_GAIN = 5, 252.0
 """Variance gain of the fifth difference for white noise: 1 + 25 + 100 + 100 + 25 + 1.  A tremor of 12 Hz sampled at
 200 Hz passes with 1/2000 of its amplitude; with a lower order as much of it would pass as there is noise."""
 NORMAL_MEDIAN = 0.6745
+"""Median of |x| for a standard normal x."""
 WALK_COMMENT = "not measured (that takes hours at rest): typical for phones"
 
 

@@ -26,6 +26,7 @@ MIN_MATCHED_FRACTION = 0.8
 MAX_CANDIDATES = 20_000
 SCORED_FRAMES = 500
 GAP_PERIODS = 5.0
+"""A gap is longer than this many median periods; the gyroscope's spline is then interrupted."""
 GAP_FLOOR_S = 0.030
 """Hand motion has little power above 10 Hz, so interpolation still follows it over 30 ms, a third of that period."""
 

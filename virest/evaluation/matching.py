@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.evaluation.fidelity import grey_levels
+
 Picture = NDArray[np.uint8]
 RATIO = 0.75
 IN_PLACE_PX = 2.0
@@ -44,9 +46,8 @@ def count_matches(picture: Picture, truth: Picture) -> Matches:
 
 def _described(picture: Picture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Positions (n, 2) and descriptors (n, 128) of an image's features."""
-    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     detector = cv2.SIFT_create()  # type: ignore[attr-defined]
-    points, descriptors = detector.detectAndCompute(grey, None)
+    points, descriptors = detector.detectAndCompute(grey_levels(picture), None)
     if descriptors is None:
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
     return np.array([p.pt for p in points], np.float32), descriptors

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from virest.camera.colmap import colmap_camera
 from virest.camera.intrinsics import Intrinsics
 from virest.errors import SettingsError
 
@@ -69,16 +70,6 @@ def require_pycolmap() -> Any:
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.logging.alsologtostderr = False
     return pycolmap
-
-
-def colmap_camera(lens: Intrinsics) -> tuple[str, list[float]]:
-    """COLMAP camera model and parameters; the centre of COLMAP's top-left pixel is (0.5, 0.5)."""
-    pinhole = [lens.fx_px, lens.fy_px, lens.cx_px + 0.5, lens.cy_px + 0.5]
-    if lens.model == "none" or not any(lens.coefficients):
-        return ("OPENCV_FISHEYE", [*pinhole, 0.0, 0.0, 0.0, 0.0]) if lens.model == "fisheye" else ("PINHOLE", pinhole)
-    if lens.model == "fisheye":
-        return "OPENCV_FISHEYE", [*pinhole, *lens.coefficients]
-    return "FULL_OPENCV", [*pinhole, *lens.coefficients, 0.0, 0.0, 0.0]
 
 
 def match_pictures(pictures: Path, work: Path, lens: Intrinsics, settings: SfmSettings) -> Path:

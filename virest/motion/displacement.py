@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
+from virest.camera.kalibr import DIFFERENCE_GAIN, DIFFERENCE_ORDER
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-FIFTH_DIFFERENCES = 252**0.5
 MIN_FINITE = 0.98
 """Smallest fraction of the rows with an acceleration; gaps are interpolated."""
 
@@ -78,7 +78,7 @@ def drift_std_m(imu: ImuSamples, span_s: float) -> float:
     force = imu.accel_m_s2[np.isfinite(imu.accel_m_s2).all(axis=1)]
     if len(force) < 12:
         return float("inf")
-    noise = float(np.median(np.std(np.diff(force, n=5, axis=0), axis=0))) / FIFTH_DIFFERENCES
+    noise = float(np.median(np.std(np.diff(force, n=DIFFERENCE_ORDER, axis=0), axis=0))) / DIFFERENCE_GAIN**0.5
     return noise * float(np.sqrt(np.median(np.diff(imu.time_s)) / 3)) * span_s**1.5
 
 

@@ -24,11 +24,10 @@ from scipy.special import gammainccinv
 
 from virest.camera.gyro_filter import delay_s
 from virest.capture.imu import ImuSamples
+from virest.capture.join import GAP_PERIODS
 from virest.errors import ImuError
 
 Array = NDArray[np.float64]
-GAP_PERIODS = 5.0
-"""A gap longer than this many median sample periods separates two splines."""
 LEAST_RUN = 32
 """Shorter runs of samples are not denoised."""
 NOISE_BAND = 0.75

@@ -31,6 +31,7 @@ from virest.camera.profile_file import read_profile
 from virest.capture.video import GrayReader
 from virest.errors import VirestError
 from virest.inference.guide_choice import track_guided
+from virest.inference.robust import NORMAL_MEDIAN
 from virest.inference.tracking_bias import STILL_SHARED, STILL_SHARED_OTHER, shared_std
 from virest.report.figures import deviation_figure
 
@@ -43,8 +44,6 @@ HIDDEN = ("time_offset", "readout_time", "gyro_bias", "imu_rotation", "focal_len
 SCENES = ("leaves", "text", "board", "photographs")
 FIRST_SEED = 2001
 FIGURE = "calibration.png"
-USUAL_MEDIAN = 0.6745
-"""Median of |x| for a standard normal x."""
 BINS = np.array([-np.inf, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, np.inf])
 
 
@@ -184,12 +183,12 @@ def summed(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _implied_factor(rows: Sequence[Row]) -> float:
-    """Factor on the shared standard deviation for which the median |error| / σ would be USUAL_MEDIAN."""
+    """Factor on the shared standard deviation for which the median |error| / σ would be NORMAL_MEDIAN."""
     error, std, shared = (np.array([row[key] for row in rows]) for key in ("error", "std", "shared_std"))
     rest = np.maximum(std**2 - shared**2, 0.0)
     factors = np.linspace(0.0, 4.0, 401)
     medians = [float(np.median(np.abs(error) / np.sqrt(rest + (factor * shared) ** 2))) for factor in factors]
-    return float(factors[int(np.argmin(np.abs(np.array(medians) - USUAL_MEDIAN)))])
+    return float(factors[int(np.argmin(np.abs(np.array(medians) - NORMAL_MEDIAN)))])
 
 
 def _shown(name: str, one: dict[str, Any]) -> list[str]:

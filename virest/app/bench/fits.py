@@ -21,6 +21,7 @@ from virest.app.bench.workload import Scale, Workload, honesty_workloads, simula
 from virest.app.console import CONSOLE, numeric_table
 from virest.app.evaluation_captures import TrueCapture, open_true_capture
 from virest.evaluation.fidelity import psnr_db
+from virest.inference.robust import MEDIAN_TO_STD
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.neighbours import confirmation
@@ -97,7 +98,7 @@ def fit_left_over(rows: Sequence[Row]) -> Row:
     return {
         "coefficients": fitted.tolist(),
         "std": std.tolist(),
-        "scatter": float(1.4826 * np.median(off_db / np.maximum(slopes, 1e-3))),
+        "scatter": float(MEDIAN_TO_STD * np.median(off_db / np.maximum(slopes, 1e-3))),
         "off_db": float(np.median(off_db)),
         "captures": len(names),
         "frames": len(rows),
