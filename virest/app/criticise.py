@@ -19,6 +19,7 @@ from virest.errors import CaptureError
 Json = dict[str, Any]
 SCHEMA = "virest/criticism/1"
 MAX_BYTES = 1 << 30
+"""The table is held in memory."""
 NAMES = ",".join(NEEDED)
 SEPARATORS = (";", "\t", ",")
 

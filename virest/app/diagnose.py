@@ -51,9 +51,11 @@ Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
 SCHEMA = "virest/diagnosis/1"
 NOT_CONSISTENT = 10
+"""Exit code with ``--check`` (docs/exit-codes.md)."""
 LADDER_PART, GAIN_PART = 0.85, 0.95
 """Progress, from 0 to 1, at which the ladder and the restorations end."""
 MAX_RUNGS = 8
+"""More panels side by side cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)

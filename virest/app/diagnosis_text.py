@@ -10,10 +10,7 @@ import numpy as np
 from virest.app.console import cell, numeric_table
 from virest.diagnosis.findings import Diagnosis, Finding, Remaining
 from virest.diagnosis.restoration_gain import RestorationGain
-from virest.report.words import residual_words
-
-SHOWN_COMPONENTS = 4
-"""Longer lists are summarised."""
+from virest.report.words import SHOWN_COMPONENTS, residual_words
 
 
 def describe(name: str, found: Diagnosis, gain: RestorationGain, wrote: str) -> str:

@@ -17,6 +17,7 @@ MAP_GAIN = 2
 HEAD_PX, GAP_PX = 22, 4
 """Height of a label, and white space to the right of and below a picture; the label's font is about 11 px high."""
 WHITE = (255, 255, 255)
+"""RGB."""
 
 
 def amplified_difference(picture: Picture, truth: Picture) -> Picture:

@@ -50,6 +50,7 @@ STANDARD: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 QUICK = ("leaves", "text")
 FRAMES, FRAMES_QUICK = 4, 2
+"""Frames of each standard capture: every method restores each, slow ones with several settings."""
 MERGED: dict[str, Any] = SIZE | {"exposure_ms": 18.0, "frames": 11}
 OVER_TIME: tuple[tuple[str, dict[str, Any]], ...] = (
     ("shake", MERGED | {"scene": "leaves", "rate_rad_s": 1.6, "noise_levels": 3.0, "seed": 61}),
@@ -64,6 +65,7 @@ JUDGED_OVER_TIME = slice(4, 7)
 SINGLE = "virest best, single"
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 SHEET_COLUMNS = 4
+"""Four frames of 640 pixels side by side: 2560 pixels."""
 
 
 @dataclass(frozen=True, slots=True)

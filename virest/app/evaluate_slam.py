@@ -44,8 +44,11 @@ from virest.restoration.settings import PRESETS
 log = logging.getLogger(__name__)
 
 SEEDS = 3
+"""The fewest runs that have a median and a spread."""
 QUICK_FRAMES, QUICK_DEVICES = 24, 2
+"""Size of a quick run: frames per capture, and phones."""
 TIMEOUT_S = 600.0
+"""For one sequence: a SLAM that takes longer is taken to hang."""
 Progress = Callable[[str, float], None]
 
 

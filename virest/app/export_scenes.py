@@ -33,6 +33,7 @@ Json = dict[str, Any]
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """Rotation between OpenGL's camera axes and ours, in both directions."""
 FIT_ANGLES = 400
+"""100 for each of the four coefficients."""
 
 
 @dataclass(frozen=True, slots=True)

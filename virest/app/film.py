@@ -24,8 +24,10 @@ Picture = NDArray[np.uint8]
 QUALITY = "17"
 """x264's constant rate factor: hardly distinguishable from the PNGs."""
 UPRIGHT = (1, 0, 0, 1)
+"""The identity: no rotation."""
 _BOXES_WITH_BOXES = (b"moov", b"trak", b"mdia")
 _MOST_HEADER_BYTES = 64 * 2**20
+"""The tables of more than a day of video, at 16 bytes per frame and 30 frames per second."""
 
 
 def write_film(

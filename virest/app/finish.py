@@ -28,6 +28,7 @@ Json = dict[str, Any]
 Picture = NDArray[np.uint8]
 Crop = tuple[int, int, int, int]
 LEAST_CROP_PX = 16
+"""The smallest frame that a camera profile accepts."""
 NAME_FIELD = "{capture}"
 LENS_ESTIMATES = ("k1", "k2", "p1", "p2", "k3", "k4")
 """Profile entries that do not apply to an undistorted picture."""

@@ -24,6 +24,7 @@ from virest.diagnosis.geometric_evidence import CAP
 from virest.diagnosis.ladder import diagnose_capture
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 11
+"""Two seconds of the simulator's usual landscape frame; any seed."""
 EVIDENCE = {
     GEOMETRY: "tracked points",
     PHOTOMETRY: "brightness along tracks",

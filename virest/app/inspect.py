@@ -17,6 +17,7 @@ from virest.errors import CaptureError, VirestError
 
 DROPPED = " dropped: "
 NOT_APPLIED_S = 1e-6
+"""Timestamps are logged in whole microseconds."""
 
 
 def inspect_capture(path: Path) -> tuple[dict[str, Any], str, int]:

@@ -13,6 +13,7 @@ from virest.errors import PARTLY_FAILED
 
 NUMBERS = (*STATUSES, "frames/s")
 WIDTH, MOST_VERDICT = 80, 21
+"""Columns of a terminal, and of the verdict in a table of several captures."""
 
 
 @dataclass(frozen=True, slots=True)

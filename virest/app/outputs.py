@@ -23,6 +23,7 @@ from virest.errors import OutputError, RestorationError
 UNPRINTABLE = ("Cc", "Zl", "Zp")
 """Unicode categories of control characters and line separators."""
 SIGNIFICANT_DIGITS = 10
+"""A microsecond in an hour; digits beyond differ between processors."""
 
 
 _HINTS = {

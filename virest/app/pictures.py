@@ -35,6 +35,7 @@ COLOURS = 192
 """Colours of a palette picture, a third of the size; photographs keep full colour."""
 PHOTOGRAPHS = ("before_after", "joint", "blur_paths")
 ARROW_STEP_PX = 80
+"""144 arrows in a frame of 1280 × 720."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,11 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEVEL = 1
 """Of ISA-L's four levels; level 0 gives files 1/6 larger in hardly less time."""
 _FILTER_UP = 2
+"""PNG's filter that subtracts the row above (PNG specification, 9.2)."""
 _COLOUR_TYPES = {1: 0, 3: 2}
 """PNG's colour type by number of channels: greyscale, truecolour."""
 MOST_PX = 2**31 - 1
+"""Width and height are 31-bit integers (PNG specification, 11.2.1)."""
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:

@@ -37,6 +37,7 @@ Json = dict[str, Any]
 NEAREST_PART = 0.25
 """The scene is the frame with the least motion among this fraction of frames, those nearest the mean view."""
 MAX_TRIES = 5
+"""Frames to restore as the scene before giving up."""
 MOST_PICTURES = 64
 """Number of image files that are measured for the bits per pixel of a capture without a movie."""
 BITS_PER_PX = (0.03, 2.0)

@@ -58,6 +58,7 @@ FRAMES_SHOWN, MOST_FRAMES = 6, 24
 PICTURE_BYTES = 4_200_000
 """All frames of a page together, base64 encoded; with the figures, a page stays below about 6 MB."""
 MAX_PROFILE_BYTES, MAX_PICTURE_BYTES = 1 << 20, 256 << 20
+"""Far larger than any file that virest writes; the files are not trusted."""
 ONLY_AFTER = "recorded frames are not shown"
 
 Json = dict[str, Any]

@@ -17,7 +17,9 @@ from virest.report.html import FrameFacts
 
 log = logging.getLogger(__name__)
 MAX_ACCOUNT_BYTES = 64 << 20
+"""Far larger than any file that virest writes."""
 MAX_COUNT, MAX_STAMP_NS = 10**9, 1 << 61
+"""More frames than a movie holds; 73 years, so differences of two timestamps fit 64 bits."""
 Model = TypeVar("Model", bound=BaseModel)
 _Count = Annotated[int, Field(ge=0, le=MAX_COUNT)]
 

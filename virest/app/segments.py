@@ -35,7 +35,9 @@ log = logging.getLogger(__name__)
 Picture = NDArray[np.uint8]
 
 MIN_SEGMENT_FRAMES, USUAL_SEGMENT_FRAMES, MAX_SEGMENT_FRAMES = 5, 10, 30
+"""Few enough to spread over the processes, with enough frames to pay for decoding from the key frame on."""
 IMU_MARGIN_S = 1.0
+"""Many samples beyond the exposures, so that the spline through them does not depend on the cut."""
 
 EDGE_PX = 0.5
 """Half-width of a pixel around its centre, as for `valid_px`."""

@@ -18,8 +18,11 @@ from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.session import SessionSettings, nominal_camera, plan_session
 
 DEVICE_FRAMES = 24
+"""Fewer than the 36 of the standard captures: there are many phones."""
 _MARGIN_S = 2.0
+"""Motion before and after the frames, longer than the 0.6 s of samples there."""
 _BITS_PER_PX = 0.6
+"""More than twice the usual 0.25: coding loss is not what is compared."""
 
 
 @dataclass(frozen=True, slots=True)

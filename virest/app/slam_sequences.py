@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 KINDS = ("global", "rolling", "restored")
 PLACEHOLDERS = ("sequence", "trajectory", "settings", "times", "seed")
 LEAST_FRAMES = 10
+"""Fewer poses hardly constrain an alignment of seven parameters."""
 _PLACE = re.compile(r"\{(\w+)\}")
 _START = "first_row_start_s"
 _MIDDLE = "middle_s"

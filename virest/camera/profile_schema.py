@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 from virest.camera.intrinsics import COEFFICIENT_NAMES
 
 MAX_SIDE_PX = 20_000
+"""More than the side of any sensor."""
 LARGEST = 1e12
 """Upper bound of any value of a profile: clocks of different epochs differ by 2e9 s.  Far larger products overflow."""
 

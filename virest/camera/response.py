@@ -24,6 +24,7 @@ from virest.errors import SettingsError
 
 KINDS = ("linear", "srgb", "gamma", "five_segment", "table")
 _LEVELS = np.arange(256) / 255.0
+"""All grey levels of 8 bits, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,6 +45,7 @@ from virest.errors import CaptureError
 
 Reader = Callable[[Path, list[Note]], Source]
 HEAD_BYTES = 4096
+"""The first lines of a log, with the header that identifies it."""
 HINT = "pass a capture folder: MARSLogger, EuRoC, images with timestamps, or a movie with .gcsv or embedded telemetry"
 
 

@@ -48,6 +48,7 @@ IMU_HEADER = (
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
 )
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+"""Rotation of a camera whose pose is not given."""
 
 Array = NDArray[np.float64]
 

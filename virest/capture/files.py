@@ -9,6 +9,7 @@ from pathlib import Path
 from virest.errors import CaptureError
 
 CHUNK_BYTES = 1 << 20
+"""Read at once, so that the memory does not grow with the file."""
 MAX_LINE_BYTES = 1 << 16
 """Real rows have up to about 200 bytes; a line above this limit is damage, or an attack on the memory."""
 MAX_TABLE_BYTES = 4 << 30

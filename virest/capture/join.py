@@ -14,7 +14,6 @@ from virest.errors import ClockError
 
 TICKS_PER_S = 90_000
 """Movie clock of Android's recorder: the 90 kHz of MPEG timestamps (ISO/IEC 13818-1, 2.4.3.7)."""
-TICK_90KHZ_NS = 1e9 / TICKS_PER_S
 STAMP_STEP_NS = 1000
 """Timestamps are truncated to whole microseconds."""
 COARSEST_TICK_NS = 1e6
@@ -25,6 +24,7 @@ MIN_MATCHED_FRACTION = 0.8
 """If fewer of the frames match a timestamp, movie and timestamps come from different recordings."""
 MAX_CANDIDATES = 20_000
 SCORED_FRAMES = 500
+"""Limits on the work for long recordings: 11 min at 30 frames/s to align with, of which 500 frames are scored first."""
 GAP_PERIODS = 5.0
 """A gap is longer than this many median periods; the gyroscope's spline is then interrupted."""
 GAP_FLOOR_S = 0.030
@@ -51,7 +51,7 @@ class Alignment:
 
 def pts_tolerance_ns(tick_ns: float) -> float:
     """Largest difference of PTS and timestamps: a tick of 90 kHz, or of a coarser movie clock, plus 1 µs."""
-    return max(TICK_90KHZ_NS, min(tick_ns, COARSEST_TICK_NS)) + STAMP_STEP_NS
+    return max(1e9 / TICKS_PER_S, min(tick_ns, COARSEST_TICK_NS)) + STAMP_STEP_NS
 
 
 def match_times(wanted_ns: Int64, rows_ns: Int64, tolerance_ns: float) -> Int64:

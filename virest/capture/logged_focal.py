@@ -15,6 +15,7 @@ VISIBLE_PX = 0.1
 ONE_LENS = (0.5, 2.0)
 """Plausible range relative to the median; values outside it are logging errors."""
 MOST_DECIMALS = 9
+"""Numbers are compared to 1e-9."""
 
 
 def focal_scales(logged_px: Array, time_s: Array, half_diagonal_px: float) -> Array | None:

@@ -49,6 +49,7 @@ KNOWN_FOCAL_PX = 1.5
 """Smallest known focal length: the app writes 1.00 for an unknown one, and 0.50 for an unknown principal point."""
 FLOAT32_STEP = 2.0**-23
 PRINTED_DIGITS = 9
+"""Relative step of a 32-bit float, and the significant digits with which it is printed."""
 COARSE_NS = 1e5
 """Note times on a coarser grid than this."""
 

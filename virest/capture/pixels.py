@@ -26,7 +26,11 @@ KR_KB = {
 }
 """Weights of red and blue in luma, by H.264's number of the matrix."""
 BT601 = 6
+"""H.264's number of the matrix that phones use, also where a movie states none."""
+BT601_LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue, the movie's usual matrix."""
 FULL_RANGE = 2
+"""FFmpeg's AVCOL_RANGE_JPEG."""
 PLANAR_8BIT = {"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p"}
 FIXED_POINT = 64
 """Fixed-point steps per grey level in the 16-bit sums: luma plus chroma stay below 2^15."""

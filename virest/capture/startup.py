@@ -22,12 +22,15 @@ REPEAT_MAX_DIFFERENCE = 0.6
 REPEAT_MAX_SHARE = 0.25
 """Largest difference of a repeat relative to the median difference of its neighbours."""
 NEIGHBOURS = 5
+"""On each side, about a third of a second in all."""
 MIN_MOTION_PX = 0.5
 """With less predicted motion between two frames, pictures may be alike without being repeats."""
 MOTION_WINDOW_S = (-0.05, 0.45)
 """Range of a picture's true time relative to its timestamp."""
 STEADY_PERCENTILE = 5.0
+"""Of the delays: nearly the smallest, without its outliers."""
 MIN_LAGS = 5
+"""Fewer delays have no reliable percentile."""
 SUSPECT_SIZE = 0.75
 """A coded frame below this fraction of its neighbours' median size may be a repeat; repeats of honor_v10 have 0.35 to
 0.65 of it."""

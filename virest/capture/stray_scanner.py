@@ -31,6 +31,7 @@ MATRIX, ODOMETRY, IMU = "camera_matrix.csv", "odometry.csv", "imu.csv"
 IN_G, IN_M_S2 = (0.5, 2.0), (5.0, 15.0)
 """Ranges of the median acceleration by which its unit is detected."""
 PRINTED_NS = 1e3
+"""Timestamps are printed in microseconds."""
 HINT = "copy the app's whole folder"
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 ROWS_AT_ONCE = 100_000
 MAX_FIELDS = 16
 MANY_FIELDS = 64
+"""Rows read at a time, and most columns: of a log, and of a table of another app."""
 MAX_RATE_RAD_S = 200.0
 """The full scale of phone gyroscopes is 35 rad/s (2000 °/s); a row above this limit is damaged."""
 

@@ -31,6 +31,7 @@ ANCHOR = 0.5
 BORDER_RADII = 2
 """Minimum width of the blended border on each side, in kernel radii."""
 STRAIGHT_SAMPLES_PER_PX = 8
+"""The kernel's ends are then placed to 1/16 px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +86,7 @@ def _scikit_richardson_lucy(plane: Plane, psf: Plane, iterations: float) -> Plan
 
 
 NOISE_TO_SIGNAL = (0.003, 0.01, 0.03, 0.1, 0.3)
+"""About half a decade apart; the best for each frame is used."""
 SCIKIT: dict[str, Baseline] = {
     "wiener": Baseline(
         _scikit_wiener, (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0), "scikit-image wiener", library="skimage"

@@ -19,6 +19,7 @@ from virest.simulation.session import Session, SessionSettings, nominal_camera, 
 
 Chart = NDArray[np.float32]
 WHITE, BLACK = 0.8, 0.03
+"""Reflectance of paper and of ink."""
 FIELDS = (9, 7)
 """Chessboard squares along the longer and the shorter side."""
 TAGS = (5, 4)
@@ -28,6 +29,7 @@ TAG_SPACING = 0.3
 BOARD_FRACTION = 0.84
 """Fraction of the frame's shorter side that the board fills."""
 MOTION_LEAD_S = 1.6
+"""Motion before and after the frames, longer than the inertial log there."""
 MARGIN = 1.25
 """Extent of the chart relative to the field of view."""
 

@@ -26,11 +26,15 @@ MAX_UNEVEN = 0.12
 A rolling shutter bends a board less.
 """
 MIN_TAGS = 4
+"""Fewer do not determine the grid's columns and perspective."""
 MAX_GRID_COLUMNS = 12
+"""Usual grids have six."""
 MAX_WINDOW_PX, MIN_WINDOW_PX = 7, 2
+"""Half widths of the window: more would reach beyond the border, less holds too few pixels."""
 TAG_CELLS = 8
 """Cells along a tag's side, border included; the refinement window is limited to the border."""
 REFINE_STEPS, REFINE_PX = 60, 1e-3
+"""Most iterations of OpenCV's corner refinement, and the step at which it ends."""
 
 
 @dataclass(frozen=True, slots=True)

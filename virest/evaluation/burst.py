@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from virest.camera.response import ResponseCurve
+from virest.evaluation.baselines import ANCHOR
 from virest.image_formation.neighbour import neighbour_view
 from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
@@ -25,7 +26,6 @@ from virest.restoration.shutter import rowwise_map, warp
 
 Picture = NDArray[np.uint8]
 Light = NDArray[np.float32]
-ANCHOR = 0.5
 REACHES = (1, 2, 3)
 """Numbers of neighbours on each side to try."""
 EXPONENTS = (3.0, 11.0, 30.0)

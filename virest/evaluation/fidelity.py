@@ -18,13 +18,20 @@ from virest.inference.tracking import TrackingSettings, find_corners
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
 MARGIN_PX = 16
+"""Excludes pixels that blur mixes with the replicated edge."""
 PEAK = 255.0
+"""Largest grey level of 8 bits."""
 SSIM_SIGMA_PX, SSIM_RADIUS_PX = 1.5, 5
 SSIM_K1, SSIM_K2 = 0.01, 0.03
+"""The values of Wang et al. 2004."""
 TRACKING = TrackingSettings(grid=(16, 16), points_per_cell=4)
+"""Up to 1024 corners, spread over the frame."""
 WINDOW_PX, LEVELS = 31, 4
+"""Window and pyramid of Lucas-Kanade: wide, since the recorded frame is blurred and displaced by tens of pixels."""
 MAX_FORWARD_BACKWARD_PX = 0.5
+"""A point that does not return to its start was lost."""
 SHIFT_SMOOTHING_PX, SHIFT_STEPS = 1.5, 6
+"""Smoothing that makes the images nearly linear over a pixel, and Gauss-Newton steps."""
 
 
 @dataclass(frozen=True, slots=True)

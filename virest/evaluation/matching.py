@@ -16,7 +16,9 @@ from virest.evaluation.fidelity import grey_levels
 
 Picture = NDArray[np.uint8]
 RATIO = 0.75
+"""Of the distances to the best and second-best match; Lowe gives 0.8, OpenCV's tutorials 0.75."""
 IN_PLACE_PX = 2.0
+"""Tolerance of a correct match, small against the spacing of features."""
 METHOD = f"SIFT (OpenCV's defaults), brute force L2, ratio {RATIO:g}; correct: within {IN_PLACE_PX:g} px"
 
 

@@ -19,9 +19,13 @@ from virest.inference.tracking import TrackPair
 
 Array = NDArray[np.float64]
 MIN_POINTS = 12
+"""Four times the three points that determine an affine field."""
 REWEIGHTINGS = 12
+"""Iterations of the reweighting."""
 LEAST_SCALE_PX = 0.05
+"""About the noise of a tracked point: with less, exact points would outweigh all others."""
 FIXED_POINT_STEPS = 8
+"""Each step reduces the error by the field's derivative times the readout, a few percent."""
 
 
 @dataclass(frozen=True, slots=True)

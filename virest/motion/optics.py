@@ -27,6 +27,7 @@ SETTLED = 16.0
 RADIUS_STEPS = 5
 """A scale over the radius changes by a few percent: each step of its inversion reduces the error by that factor."""
 _SMALL = 1e-4
+"""Below it the series, which errs by x³/24, is closer than the closed form, which loses 2e-16 / x to cancellation."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,8 @@ GRAVITY_STD_M_S2 = 0.6
 ACCEL_BIAS_STD_M_S2 = 0.15
 ACCEL_DELAY_STD_S = 0.004
 PLANE_STD_PER_M = 1.5
+"""Standard deviations of the priors: walking pace; gravity's direction to 3.5°; an accelerometer's bias of 15 mg; a
+delay of one sample at 250 Hz; a scene at 0.7 m or farther."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,13 +13,17 @@ from numpy.typing import NDArray
 WIDTH, HEIGHT = 360.0, 176.0
 """Size of a chart in units of about one phone pixel, so that labels stay readable at that width."""
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 10.0, 10.0, 34.0
+"""Margins in units of the view box: room for the axis labels."""
 MAX_COLUMNS = 300
 """Longer series are drawn by their minimum and maximum in this many columns."""
 TICKS = 4
+"""As many labels as fit a chart of this height."""
 ABSURD = 1e12
 """Absolute values above this, and infinite ones, are not drawn."""
 MAX_ARROWS = 80
+"""More cannot be told apart in a picture of this size."""
 ARROW_SCALES = (1, 2, 3, 5, 8, 12, 20)
+"""Whole factors of about 1.5 each."""
 ARROW_REACH = 0.9
 """The longest arrow, as a fraction of the distance between arrows."""
 HEAD_RAD, HEAD_PART, HEAD_MAX = 0.45, 0.4, 0.016

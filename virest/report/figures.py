@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.calibration.response_curve import CurveFit
+from virest.capture.pixels import BT601_LUMA
 from virest.effects.records import PHOTOMETRY
 from virest.errors import printable
 
 FORMATS = ("png", "svg", "pdf")
 MAX_POINTS = 12_000
+"""Drawn points of a cloud; more only make the file larger."""
 DPI = 110
+"""1200 pixels for a figure of 11 inches, the width of the page."""
 DARK, ON_DARK = "#1b1f22", "#e4e6e8"
 """Background of figures with photographs, and text on it."""
 COVARIATES = {"row": "fraction of the readout", "time": "time, s", "radius": "radius, px", "rate": "rate, rad/s"}
@@ -26,6 +29,7 @@ BINS, MIN_IN_BIN = 24, 8
 LEAST_BARS = 3
 """A rung with fewer candidates is drawn with room for this many."""
 MOST_DEVIATIONS, DEVIATION_BARS = 4.0, 16
+"""A normal error beyond 4 σ is one of 16 000; bars are half a σ wide."""
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -257,7 +261,7 @@ def _printed_rms(x_px: Any, y_px: Any) -> float:
 
 def _luma(picture: Picture) -> Array:
     values = np.asarray(picture, float)
-    return values if values.ndim == 2 else values @ np.array([0.299, 0.587, 0.114])
+    return values if values.ndim == 2 else values @ np.array(BT601_LUMA)
 
 
 def canvas(width_in: float, height_in: float) -> Any:

@@ -39,6 +39,7 @@ TEMPLATES = "templates"
 RENDITIONS = ((1280, 88), (1280, 78), (1024, 76), (800, 74), (640, 72), (480, 70), (360, 64), (240, 60), (160, 50))
 """Longest side in pixels and WebP quality: the first that fits the byte limit is used."""
 FIGURE_SIDE_PX, FIGURE_QUALITY = 1700, 82
+"""Largest side and WebP quality: labels stay sharp on screens of twice the density."""
 FIRST_FIGURES = ("residuals", "pictures")
 """Figures of a diagnosis that are shown at once; the others are collapsed."""
 STATES = ("restored", "copied", "skipped", "failed")

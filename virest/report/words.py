@@ -68,6 +68,7 @@ CAMERA_KEYS = (
 DEFAULTS = {"gyro_bias_rad_s": [0.0, 0.0, 0.0], "clock_skew": 0.0, "exposure_scale": 1.0}
 """Default values of a profile; whether they were given or assumed is unknown."""
 SHOWN_COMPONENTS = 4
+"""Longer lists are summarised, here and in the printed text."""
 
 Mapped = Mapping[str, Any]
 

@@ -18,6 +18,7 @@ from virest.errors import SettingsError
 Array = NDArray[np.float64]
 NOMINAL_ISO = 144
 LOWEST_ISO = 50
+"""ISO without auto-exposure, and the lowest of a phone's sensor."""
 MAX_RANGE_EV = 12.0
 WALK_WAVES = 4
 """Cosines of 0.6, 1.2, 1.8 and 2.4 periods per capture, amplitude ∝ 1 / periods, so adjacent frames differ little."""

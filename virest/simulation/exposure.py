@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.errors import SettingsError
-from virest.simulation.hand_motion import HandMotion
+from virest.simulation.hand_motion import FINE_STEP_S, HandMotion
 from virest.simulation.hidden import NOTHING, Hidden, focal_changes, focal_scale, late_rows_s, seen_radius_px
 from virest.simulation.scenes import Scene
 
@@ -29,7 +29,6 @@ STEP_PX = 0.4
 """Maximum image motion between two instants."""
 FINEST_STEP_PX = 0.1
 """An exposure spans at least four steps, unless they would be shorter than this motion."""
-_FILTER_STEP_S = 5e-4
 _CONVERGED = 1e-12
 """Residual in x/z and y/z at which Newton's method stops; below it lies rounding error."""
 
@@ -174,12 +173,12 @@ def high_passed_angles(motion: HandMotion, cutoff_hz: float, rest_s: float) -> t
 
     First-order filter ``θ' = ω − 2π cutoff θ``, solved exactly for a rate linear within each step.
     """
-    time_s = np.arange(rest_s, motion.end_s, _FILTER_STEP_S)
+    time_s = np.arange(rest_s, motion.end_s, FINE_STEP_S)
     rate = motion.rate_rad_s(time_s)[:, :2]
     corner = 2 * np.pi * cutoff_hz
-    decay = np.exp(-corner * _FILTER_STEP_S)
+    decay = np.exp(-corner * FINE_STEP_S)
     mean = (1 - decay) / corner
-    ramp = (1 - mean / _FILTER_STEP_S) / corner
+    ramp = (1 - mean / FINE_STEP_S) / corner
     drive = (mean - ramp) * rate[:-1] + ramp * rate[1:]
     angle = np.zeros_like(rate)
     for i, step in enumerate(drive):

@@ -20,11 +20,14 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
-NODE_STEP_S = 5e-4
+FINE_STEP_S = 5e-4
+"""Step of the simulator's fine time grids: 1/160 of the shortest period of the hand's motion, 12 Hz."""
 SHARE_PER_AXIS = (0.64, 0.64, 0.42)
 """Fraction of the RMS rate on pitch, yaw and roll: hands roll less than they pitch and yaw."""
 _GAUSS = 0.5 - np.sqrt(3.0) / 6.0
+"""Node of two-point Gauss-Legendre quadrature on [0, 1]; the other is 1 − this."""
 _COMPONENTS = 18
+"""Sinusoids per axis, one in each of as many parts of the band: too many for a visible period."""
 
 
 class Signal(Protocol):
@@ -86,7 +89,7 @@ class HandMotion:
     def rotation(self, time_s: Array) -> Rotation:
         """Orientation, world from camera, at times (n,)."""
         time_s = np.atleast_1d(np.asarray(time_s, float))
-        nearest = np.clip(np.round((time_s - self.node_s[0]) / NODE_STEP_S).astype(int), 0, len(self.node_s) - 1)
+        nearest = np.clip(np.round((time_s - self.node_s[0]) / FINE_STEP_S).astype(int), 0, len(self.node_s) - 1)
         step = time_s - self.node_s[nearest]
         start = Rotation.from_quat(self.node_quat[nearest], scalar_first=True)
         return start * Rotation.from_rotvec(_magnus(self.rate, self.node_s[nearest], step))
@@ -157,11 +160,11 @@ def integrate_motion(
     rate: Signal, sway: Signal, start_s: float, end_s: float, *, centre_on_s: tuple[float, float]
 ) -> HandMotion:
     """Integrate orientation over [start_s, end_s]; world axes are the mean orientation over ``centre_on_s``."""
-    count = int(np.ceil((end_s - start_s) / NODE_STEP_S)) + 1
-    node_s: Array = start_s + NODE_STEP_S * np.arange(count, dtype=float)
-    steps = Rotation.from_rotvec(_magnus(rate, node_s[:-1], np.full(count - 1, NODE_STEP_S, float)))
+    count = int(np.ceil((end_s - start_s) / FINE_STEP_S)) + 1
+    node_s: Array = start_s + FINE_STEP_S * np.arange(count, dtype=float)
+    steps = Rotation.from_rotvec(_magnus(rate, node_s[:-1], np.full(count - 1, FINE_STEP_S, float)))
     quat = _running_product(steps.as_quat(scalar_first=True))
-    inside = (node_s >= centre_on_s[0] - NODE_STEP_S / 2) & (node_s <= centre_on_s[1] + NODE_STEP_S / 2)
+    inside = (node_s >= centre_on_s[0] - FINE_STEP_S / 2) & (node_s <= centre_on_s[1] + FINE_STEP_S / 2)
     chosen = quat[inside] if inside.any() else quat[:1]
     mean = Rotation.from_quat(chosen, scalar_first=True).mean()
     centred = mean.inv() * Rotation.from_quat(quat, scalar_first=True)

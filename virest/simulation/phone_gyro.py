@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, cont2discrete, lfilter, lfilter_zi, sosfilt
 
+from virest.simulation.hand_motion import FINE_STEP_S
+
 Array = NDArray[np.float64]
 
-FINE_STEP_S = 5e-4
 SETTLING_PERIODS = 2.0
 """Periods of the corner frequency by which the filter starts before the first sample, settled at the first rate."""
 LEAST_RESPONSE = 0.1

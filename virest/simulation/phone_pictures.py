@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.capture.pixels import BT601_LUMA
 from virest.simulation.phone_isp import PhoneIsp
 
 Image = NDArray[Any]
@@ -20,6 +21,7 @@ SPACE_SIGMA_PX, SPACE_WINDOW_PX = 2.0, 9
 """Spatial sigma of the bilateral filter, and its window width."""
 CHROMA_RADIUS_PX = 4
 CHROMA_TIMES_LUMA = 2.0
+"""Colour is smoothed over a larger area and more strongly than luma: the eye resolves it less."""
 MOTION_BOX_PX = 5
 """Width of the box over which frame differences are averaged for motion detection."""
 STILL_SIGMAS = 3.0
@@ -31,6 +33,7 @@ BASE_REDUCTION = 4
 BASE_EDGE = 0.1
 """Grey-level contrast above which the base layer preserves an edge."""
 MIDDLE_GREY, DARKEST = 0.46, 0.02
+"""An 18 % grey card in sRGB, which local tone mapping leaves as it is; darker pixels are lifted no further."""
 
 
 class PhonePictures:
@@ -145,7 +148,8 @@ def sharpen(grey: Image, amount: float, radius_px: float) -> Image:
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-_TO_YCC = np.array([[0.299, 0.587, 0.114], [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]], np.float32)
+_TO_YCC = np.array([BT601_LUMA, [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]], np.float32)
+"""Luma and colour differences of JPEG (JFIF 1.02, from BT.601)."""
 _FROM_YCC = np.linalg.inv(_TO_YCC.astype(np.float64)).astype(np.float32)
 
 

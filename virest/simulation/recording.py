@@ -42,10 +42,13 @@ LAYOUTS = ("2021", "v2.0")
 """With Unix-time columns (builds after April 2021) and without (the release tagged v2.0)."""
 CLOCKS = ("REALTIME", "UNKNOWN")
 _UNIX_MINUS_BOOT_NS = 1_663_377_777_000_000_000
+"""The phone was started on 2022-09-17."""
 _SLEPT_NS = 22_319_432_485_000
 """CLOCK_BOOTTIME − CLOCK_MONOTONIC: time that the phone has spent asleep."""
 _EPOCH_JITTER_NS = 8_301
+"""Time between the reading of two clocks for edge_epochs.txt."""
 _TRAJECTORY_STEP_S = 1e-3
+"""Finer than the samples, so that interpolation between its rows is exact enough for truth."""
 _PNG_OPTIONS = [
     cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG,

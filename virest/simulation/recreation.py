@@ -36,8 +36,11 @@ NOT_RECREATABLE = frozenset({NO_IMU, IMU_GAP, NO_STAMP})
 LEAST_AHEAD = 0.15
 """Minimum z, scene axes, of the unit rays through a frame's corners; below it the scene plane does not cover them."""
 IMU_MARGIN_S = 1.0
+"""As much of the log beyond the frames as `virest process` uses."""
 _CHART_MARGIN = 1.02
+"""Room for the lens's blur at the chart's edge."""
 _LEAST_FACTOR = 1e-3
+"""Keeps the inverse of the scale finite for absurd fields."""
 _RADIUS_ITERATIONS = 5
 """If the focal length varies over the radius by a few per cent, each iteration reduces the error by that factor."""
 

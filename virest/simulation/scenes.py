@@ -25,9 +25,11 @@ log = logging.getLogger(__name__)
 KINDS = ("leaves", "bright", "board", "text", "photographs")
 LENS_SIGMA_PX = 0.5
 MAX_CHART_PX = 36_000_000
+"""0.4 GB as 32-bit RGB."""
 PHOTOGRAPHS = ("astronaut", "chelsea", "coffee", "rocket")
 """Colour photographs in scikit-image: a portrait, fur, a table, a rocket at night."""
 _TEXTURE_SIDE = 512
+"""All leaves cut their texture from one periodic picture: larger than a leaf, and fast to transform."""
 _TEXT = (
     "the quick brown fox jumps over the lazy dog",
     "restored frames keep the lens, undo the hand",

@@ -44,12 +44,15 @@ LONGEST_EXPOSURE_S = 10.0
 LONGEST_OFFSET_S = 600.0
 FASTEST_HAND_RAD_S = 100.0
 NEAREST_M, FARTHEST_M = 0.001, 1e6
+"""Limits of the renderer, far beyond any phone's recording."""
 FOCAL_OF_LONG_SIDE = (0.05, 100.0)
 """Limits of the renderer, the focal length as a multiple of the long side; beyond them memory or precision runs out."""
 WHOLE_FRAMES = ("delay", ("time",))
 """Kind and covariates of fields that delay all rows of a frame."""
 _IMU_LEAD_S = 0.6
+"""The log begins this long before the first frame and ends as long after the last: an offset of 0.4 s leaves 0.2 s."""
 _SCENE_MARGIN = 1.12
+"""The scene is drawn larger than the nominal view, so that a small hidden effect leaves it unchanged."""
 
 
 @dataclass(frozen=True, slots=True)

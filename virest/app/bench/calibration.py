@@ -38,13 +38,16 @@ from virest.report.figures import deviation_figure
 Array = NDArray[np.float64]
 Row = dict[str, Any]
 FRAMES, QUICK_SEEDS = 90, 12
+"""Three seconds, as long as the captures of the other sections; seeds of a quick run."""
 EXTRA = ("focal", "distortion", "principal-point")
 HIDDEN = ("time_offset", "readout_time", "gyro_bias", "imu_rotation", "focal_length", "radial_distortion",
           "principal_point")  # fmt: skip
 SCENES = ("leaves", "text", "board", "photographs")
 FIRST_SEED = 2001
+"""First of this section's seeds."""
 FIGURE = "calibration.png"
 BINS = np.array([-np.inf, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, np.inf])
+"""Edges of the printed histogram of e / σ, with the tails beyond 3 σ apart."""
 
 
 def calibration_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:

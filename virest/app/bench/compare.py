@@ -34,6 +34,7 @@ NAMES = (
 NOISE = 0.15
 """Relative change up to which two timings on one quiet machine may be equal."""
 MEMORY_NOISE = 0.05
+"""The same for memory, which other processes hardly change."""
 NOISE_DB = 0.05
 """Absolute change in dB: gains do not depend on the machine's load, and their ratio is meaningless near zero."""
 BUSY_CORES = 0.25

@@ -15,6 +15,7 @@ from virest.app.bench.workload import Scale, looped_capture, run_process
 from virest.app.console import numeric_table
 
 CAPTURES, MINUTES, FPS = 10_000, 5, 30
+"""Assumption: the archive to process, of 5 min at 30 frames/s each."""
 DOLLARS_PER_CORE_HOUR = 0.04
 """Assumption: a rented core with 4 GB, on demand; spot prices are a third."""
 DOLLARS_PER_TB_MONTH = 23.0
@@ -22,6 +23,7 @@ DOLLARS_PER_TB_MONTH = 23.0
 LINK_GBIT_S = 10.0
 """Assumption: write bandwidth of the storage."""
 SAMPLE_FRAMES = 30
+"""One second of movie, with one key frame."""
 
 
 def cost_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.bench.workload import Picture, Scale, recorded_frames, simulated
+from virest.app.bench.workload import FINE_BITS, Picture, Scale, recorded_frames, simulated
 from virest.app.console import cell, numeric_table
 from virest.app.evaluation_captures import truth_frame
 from virest.camera.response import ResponseCurve
@@ -25,11 +25,10 @@ from virest.restoration.capture import RestorationPlan, restore_frames
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import PRESETS, RestorationSettings
 
-FINE_BITS = 1.0
-"""Bits per pixel, high enough that coding loss does not mask the effect of the curve."""
 BASE: dict[str, Any] = {"width": 640, "height": 480, "exposure_ms": 16.0, "rate_rad_s": 1.4, "noise_levels": 1.0,
                         "bitrate_bits_per_px": FINE_BITS}  # fmt: skip
 SEEDS = (11, 12, 13)
+"""Three draws of the scene, so that a mean has a spread."""
 GAMMA, LINEAR, SRGB = ResponseCurve("gamma", gamma=2.2), ResponseCurve("linear"), ResponseCurve("srgb")
 BENT = ResponseCurve("five_segment", b=(0.065, 0.048), c=(0.4, 0.6), y_max=1.0)
 """With dead leaves, toe and shoulder together hold about 20 % of the pixels."""
@@ -150,6 +149,7 @@ CLIPPING = ("sunlit", "highlights")
 """Leaves exposed so that CLIPPED_SHARE of the pixels clip; leaves with highlights of up to 12 times the clip level on
 about 3 % of the area."""
 CLIPPED_SHARE = 0.03
+"""As many pixels as the highlights of the other scene."""
 
 
 def clipping_rows(work: Path, name: str, seeds: tuple[int, ...], frames: int) -> list[dict[str, Any]]:

@@ -20,8 +20,10 @@ from virest.diagnosis.findings import CONSISTENT, Diagnosis
 from virest.diagnosis.ladder import diagnose_capture
 
 FRAMES = 90
+"""Three seconds of movie."""
 SCENES = ("leaves", "text", "board")
 SEEDS = {"quick": 1, "normal": 2, "full": 4}
+"""Captures per effect."""
 Case = tuple[str, int]
 
 

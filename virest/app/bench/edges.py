@@ -31,8 +31,11 @@ MOTIONS = ((0.4, 6.0), (0.6, 8.0), (1.2, 12.0))
 MASKS = ((0.0, 1.0), (0.4, 1.0), (0.7, 1.0), (1.0, 1.5))
 """Amount and radius in px of the unsharp mask; the first entry is no sharpening."""
 FRAMES, FIRST_SEED = 6, 7000
+"""The edge spread is measured in single frames; first of this section's seeds."""
 DEFOCUS_PX, SOFT_SCENES = (2.0, 2.5, 3.0, 3.5), ("leaves", "text", "board", "photographs")
+"""σ of the added defocus; the scenes above without ``bright``."""
 SOFT_FRAMES, FIRST_SOFT_SEED = 60, 7200
+"""Defocus is fitted to a whole capture, here two seconds."""
 
 
 def edges_section(work: Path, scale: Scale) -> tuple[Row, str]:

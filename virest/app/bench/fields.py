@@ -37,11 +37,14 @@ Array = NDArray[np.float64]
 Row = dict[str, Any]
 Draw = Callable[[np.random.Generator, float], "UnknownEffect"]
 SIZE, SMALL, FPS = (640, 480), (480, 360), 30.0
+"""Frame, the smaller frame of the other captures, and frame rate."""
 FRAMES, FRAMES_OF_OTHER = 96, 50
+"""3.2 s to diagnose, and 1.7 s of another capture in which the found field is tested."""
 FIRST_SEED, FIRST_NULL = 7100, 8100
 """First seeds of captures with and without an unknown effect."""
 SEEDS = {"quick": 1, "usual": 2, "full": 6}
 NULLS = {"quick": 4, "usual": 16, "full": 50}
+"""Captures per effect, and captures without one: their number bounds the rate of false alarms that can be seen."""
 SCENES = ("leaves", "text", "board", "bright", "photographs")
 SOLVED = 0.8
 """Minimum fraction of the excess residual (squared) that a correct field removes in another capture."""

@@ -21,8 +21,11 @@ PRESET = "fast"
 FRAMES, QUICK_FRAMES = 100, 40
 """N; runs over N, 2 N and 4 N frames."""
 SIZES = ((360, 640), (540, 960), (720, 1280))
+"""Areas of 1, 2.25 and 4: enough for the exponent of the time over the pixels."""
 SIZE_FRAMES, QUICK_SIZE_FRAMES = 20, 10
+"""N for each size; the time per frame is the difference of runs over N and 2 N."""
 TILES_PX = (72, 104, 144, 208)
+"""About the usual 104 px by factors of √2, so that the area doubles."""
 Facts = dict[str, Any]
 
 

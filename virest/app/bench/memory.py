@@ -17,7 +17,9 @@ from virest.app.console import numeric_table
 FRAMES = (100, 600)
 QUICK_FRAMES = (20, 60)
 FULL_FRAMES = (100, 3000)
+"""Few and many frames: peaks that differ show memory that grows with the length of the movie."""
 SAMPLE_S = 0.05
+"""Shorter than the work on one frame, so that its peak is seen."""
 PRESET = "fast"
 
 

@@ -14,6 +14,7 @@ from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.evaluation.fidelity import point_distances_px
 
 SIZES = {"640x480": (640, 480), "720x1280": (720, 1280)}
+"""The simulator's usual frame in landscape and in portrait."""
 
 
 def shutter_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:

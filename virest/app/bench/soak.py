@@ -24,11 +24,17 @@ from virest.app.console import numeric_table
 from virest.errors import PARTLY_FAILED
 
 CAPTURES, QUICK_CAPTURES = 200, 20
+"""Small captures, many of them: what leaks per capture accumulates."""
 BROKEN_EVERY = 10
+"""One capture in ten is damaged, each defect in turn."""
 FRAMES = 8
+"""Enough for one segment; the section tests the handling of captures, not of frames."""
 SAMPLE_S = 0.25
+"""Many samples of the memory per run, at a negligible load."""
 HEAD_LINES = 1
+"""Lines before the first row of the gyroscope's log."""
 SHIFT_NS = 10**15
+"""11.6 days: no sample covers a frame any more."""
 
 
 def soak_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:

@@ -41,6 +41,7 @@ QUICK_FRAMES = dict.fromkeys(FRAMES, 60)
 """Frames N with two processes, in segments of ten; one process gets half as many.  N covers whole loops of the capture,
 since its frames differ in blur."""
 JOBS = 2
+"""The fewest that show how the speed scales."""
 PEER_TRIES = 2
 """Number of runs, of which the faster counts."""
 STAGES = ("decode", "estimate", "deblur", "shutter", "write")

@@ -17,6 +17,7 @@ LEAST_PHONE_GAIN_DB = {"fast": 1.2, "balanced": 1.6, "best": 1.8}
 MOST_PREDICTION_OFF_DB = 0.5
 LEAST_RATE = {"balanced": 8.0, "best": 0.3}
 MOST_WORKER_MB, MOST_GROWTH = 400.0, 1.05
+"""What the bench demands: shares of the time, gains and errors in dB, frames per second, memory."""
 MOST_EXPONENT = 1.1
 """Exponent of the time over frames: with twice as many frames, each takes at most 7 % longer."""
 

@@ -87,6 +87,7 @@ def _workload(
 FINE_BITS = 1.0
 """Bits per pixel of captures with little coding loss; the recorder's own rate is 0.25."""
 ORDINARY_PX, LONG_PX = (5.0, 20.0), (15.0, 45.0)
+"""Range of the blur's length over the frames that a capture is drawn for."""
 WORKLOADS = (
     _workload("leaves", "ordinary", ORDINARY_PX, "leaves", 16.0, 1.4, 1.5),
     _workload("text", "ordinary", ORDINARY_PX, "text", 16.0, 1.4, 2.0),

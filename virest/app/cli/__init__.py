@@ -32,6 +32,7 @@ USAGE = 2
 INTERRUPTED = 130
 TERMINATED = 143
 CLOSED_PIPE = 141
+"""Exit codes: 2 as usual for wrong usage, else 128 + the signal (SIGINT 2, SIGTERM 15, SIGPIPE 13), as shells do."""
 _SYSTEM_HINTS = {
     errno.ENOSPC: "free some space there",
     errno.EDQUOT: "your disk quota is exhausted; free some space there",
