@@ -76,6 +76,23 @@ class _Joined:
     unix_lag_s: NDArray[np.float64] | None
 
 
+@dataclass(frozen=True, slots=True)
+class _Recording:
+    """A capture's files on one time axis, before its frames are judged."""
+
+    files: Source
+    joined: _Joined
+    shift_ns: int
+    """Added to the camera's stamps, for the IMU's clock."""
+    time_s: NDArray[np.float64]
+    """(n,) times of the frames from stamp_0."""
+    imu: ImuSamples
+    gaps: tuple[tuple[float, float], ...]
+    metadata: CaptureMetadata
+    notes: list[Note]
+    """Every step may add to them."""
+
+
 def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
     """Read, join and check a capture folder.
 
@@ -97,8 +114,9 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
     gaps = find_gaps(imu.time_s)
     metadata = summarise(files, notes)
     time_s = (joined.stamps_ns + shift_ns - zero_ns) / 1e9
-    began = _startup(files, joined, time_s, imu, metadata, notes, look_at_pictures)
-    frames = _frames(files, joined, shift_ns, time_s, imu, gaps, metadata, began, notes)
+    recording = _Recording(files, joined, shift_ns, time_s, imu, gaps, metadata, notes)
+    began = _startup(recording, look_at_pictures)
+    frames = _frames(recording, began)
     _note_imu(imu, gaps, notes)
     _note_frames(frames, notes)
     return Capture(
@@ -229,31 +247,24 @@ def _unix_lag_s(files: Source, alignment: Alignment, joined: NDArray[np.int64]) 
 # ── start-up, frames, report ─────────────────────────────────────────────────────────────────────────────────────
 
 
-def _startup(
-    files: Source,
-    joined: _Joined,
-    time_s: NDArray[np.float64],
-    imu: ImuSamples,
-    metadata: CaptureMetadata,
-    notes: list[Note],
-    look_at_pictures: bool,
-) -> start.Startup:
+def _startup(recording: _Recording, look_at_pictures: bool) -> start.Startup:
+    files, joined, time_s, imu = recording.files, recording.joined, recording.time_s, recording.imu
     period = median_period_s(time_s)
     repeats: tuple[int, ...] = ()
     later: tuple[int, ...] = ()
     if look_at_pictures and len(time_s) > 2:
         look = int(np.searchsorted(time_s, time_s[0] + start.LOOK_S))
-        focal = metadata.fx_px or GUESSED_FOCAL * max(files.movie.width, files.movie.height)
+        focal = recording.metadata.fx_px or GUESSED_FOCAL * max(files.movie.width, files.movie.height)
         motion = start.expected_motion_px(time_s, imu.time_s, imu.gyro_rad_s, focal, period)
         if (motion[:look] > start.MIN_MOTION_PX).any():
             repeats = start.find_repeats(_differences(files, range(look), look), motion[:look])
         later = _later_repeats(files, look, motion)
     began = start.judge_startup(joined.unix_lag_s, repeats, len(time_s), period)
     if began.frames:
-        notes.append(_startup_note(began))
+        recording.notes.append(_startup_note(began))
     stalls = start.find_stalls(later, joined.unix_lag_s, max(began.frames, 1), period)
     if stalls:
-        notes.append(_stall_note(stalls, later))
+        recording.notes.append(_stall_note(stalls, later))
     return replace(began, stalls=stalls)
 
 
@@ -272,10 +283,8 @@ def _later_repeats(files: Source, look: int, motion_px: NDArray[np.float64]) -> 
         return ()
     wanted = [k for k in start.suspects(size, files.movie.keyframes, look) if motion_px[k] > start.MIN_MOTION_PX]
     found: tuple[int, ...] = ()
-    for reach in (
-        1,
-        2 * start.REPEATS_APART,
-    ):  # a repeated key frame is as large as any other, so search the neighbourhood of small frames
+    # a repeated key frame is as large as any other, so search the neighbourhood of small frames
+    for reach in (1, 2 * start.REPEATS_APART):
         around = sorted({n for k in wanted for n in range(max(k - reach, look), k + reach + 1) if n < len(size)})
         found = start.find_repeats(_differences(files, around, len(size)), motion_px) if around else ()
         wanted = list(found)
@@ -306,20 +315,11 @@ def _startup_note(began: start.Startup) -> Note:
     return Note("warning", "content-lag", text)
 
 
-def _frames(
-    files: Source,
-    joined: _Joined,
-    shift_ns: int,
-    time_s: NDArray[np.float64],
-    imu: ImuSamples,
-    gaps: tuple[tuple[float, float], ...],
-    metadata: CaptureMetadata,
-    began: start.Startup,
-    notes: list[Note],
-) -> tuple[Frame, ...]:
+def _frames(recording: _Recording, began: start.Startup) -> tuple[Frame, ...]:
+    files, joined, imu, metadata = recording.files, recording.joined, recording.imu, recording.metadata
     readout_s = metadata.readout_time_s or 0.0
-    exposures_s = _exposures_s(files, joined, time_s, notes)
-    scales = _focal_scales(files, joined, time_s, notes)
+    exposures_s = _exposures_s(recording)
+    scales = _focal_scales(recording)
     imu_period_s = median_period_s(imu.time_s)
     frames = []
     for i, row in enumerate(joined.metadata_rows.tolist()):
@@ -332,14 +332,14 @@ def _frames(
             reasons.append((STALL, "encoder stall: content may be later than its stamp"))
         if not joined.has_stamp[i]:
             reasons.append((NO_STAMP, f"no row in {files.names.stamps if files.stamps else files.names.metadata}"))
-        start_s = float(time_s[i])
+        start_s = float(recording.time_s[i])
         end_s = start_s + (exposure_s or metadata.exposure_s or 0.0) + readout_s
-        if outside := outside_reason(start_s, end_s, imu.time_s, gaps, imu_period_s):
+        if outside := outside_reason(start_s, end_s, imu.time_s, recording.gaps, imu_period_s):
             reasons.append(outside)
         frames.append(
             Frame(
                 index=i,
-                timestamp_ns=int(joined.stamps_ns[i]) + shift_ns,
+                timestamp_ns=int(joined.stamps_ns[i]) + recording.shift_ns,
                 time_s=start_s,
                 exposure_s=exposure_s,
                 iso=_value(files.metadata.iso, row) if files.metadata else None,
@@ -352,36 +352,36 @@ def _frames(
     return tuple(frames)
 
 
-def _exposures_s(files: Source, joined: _Joined, time_s: NDArray[np.float64], notes: list[Note]) -> list[float | None]:
+def _exposures_s(recording: _Recording) -> list[float | None]:
     """Exposure of each frame; missing ones are interpolated, since automatic exposure changes gradually."""
-    if files.metadata is None:
+    time_s, table = recording.time_s, recording.files.metadata
+    if table is None:
         return [None] * len(time_s)
-    rows = joined.metadata_rows
-    logged = np.where(rows >= 0, files.metadata.exposure_s[rows], np.nan)
+    rows = recording.joined.metadata_rows
+    logged = np.where(rows >= 0, table.exposure_s[rows], np.nan)
     known = np.isfinite(logged)
     if not known.any():
         return [None] * len(time_s)
     missing = np.flatnonzero(~known)
     if len(missing):
         text = f"{len(missing)} of {len(known)} frames have no exposure time; it is interpolated: {_listed(missing)}"
-        notes.append(Note("warning", "exposure-interpolated", text))
+        recording.notes.append(Note("warning", "exposure-interpolated", text))
     return [float(value) for value in np.interp(time_s, time_s[known], logged[known])]
 
 
-def _focal_scales(
-    files: Source, joined: _Joined, time_s: NDArray[np.float64], notes: list[Note]
-) -> NDArray[np.float64] | None:
+def _focal_scales(recording: _Recording) -> NDArray[np.float64] | None:
     """Focal length of each frame over the median; None if it is not logged or does not change."""
+    files, rows = recording.files, recording.joined.metadata_rows
     if files.metadata is None:
         return None
-    rows, half_diagonal = joined.metadata_rows, 0.5 * float(np.hypot(files.movie.width, files.movie.height))
-    scales = focal_scales(np.where(rows >= 0, files.metadata.fx_px[rows], np.nan), time_s, half_diagonal)
+    half_diagonal = 0.5 * float(np.hypot(files.movie.width, files.movie.height))
+    scales = focal_scales(np.where(rows >= 0, files.metadata.fx_px[rows], np.nan), recording.time_s, half_diagonal)
     if scales is not None:
         text = (
             f"the focal length in {files.names.metadata} changes from {scales.min() - 1:+.2%} to "
             f"{scales.max() - 1:+.2%} of its median (the lens refocuses): it is followed frame by frame"
         )
-        notes.append(Note("info", "focal-varies", text))
+        recording.notes.append(Note("info", "focal-varies", text))
     return scales
 
 
