@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from virest.app.process_map import _SharedOut, process_map
+from virest.app.process_map import _ProcessPool, process_map
 from virest.inference.parallel import begun, one_by_one
 
 
@@ -63,7 +63,7 @@ def test_an_interruption_waits_for_no_worker() -> None:
 
     def interrupted() -> None:
         with process_map(2) as each:
-            assert isinstance(each, _SharedOut)
+            assert isinstance(each, _ProcessPool)
             each._submit(time.sleep, (3600,))
             assert each._pool is not None
             begun.extend(each._pool._processes.values())

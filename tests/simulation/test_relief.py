@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from virest.simulation.scenes import ReliefScene, Scene, hang_before, move_things_before
+from virest.simulation.scenes import ReliefScene, Scene, add_moving_objects, add_near_objects
 
 NEAR_M, FAR_M, FOCAL = 1.1, 1.9, 50.0
 CENTRE = np.array([59.5, 39.5])
@@ -64,7 +64,7 @@ def test_poses_at_several_times_give_pairs_of_homographies(rng: np.random.Genera
 def test_things_hung_before_a_scene_hide_some_of_it_and_not_all(rng: np.random.Generator):
     """The farther plane stays as it was; covered light never exceeds the cover."""
     plane = Scene(chart(rng), FOCAL, FAR_M)
-    scene = hang_before(plane, rng, depth_m=NEAR_M, focal_px=FOCAL)
+    scene = add_near_objects(plane, rng, depth_m=NEAR_M, focal_px=FOCAL)
     (near,) = scene.nearer
     assert (scene.depth_m, near.depth_m) == (FAR_M, NEAR_M)
     np.testing.assert_array_equal(scene.chart, plane.chart)
@@ -74,9 +74,9 @@ def test_things_hung_before_a_scene_hide_some_of_it_and_not_all(rng: np.random.G
 
 
 def test_things_that_move_go_their_own_ways_and_the_scene_stays(rng: np.random.Generator):
-    """Three planes of things, in directions a third of a turn apart; at time 0 they are where they were drawn."""
+    """Three planes of objects, in directions a third of a turn apart; at time 0 they are where they were drawn."""
     plane = Scene(chart(rng), FOCAL)
-    scene = move_things_before(plane, rng, speed_px_s=100.0, focal_px=FOCAL)
+    scene = add_moving_objects(plane, rng, speed_px_s=100.0, focal_px=FOCAL)
     drifts = np.array([p.drift_per_s for p in scene.nearer])
     assert drifts.shape == (3, 2)
     assert (np.hypot(*drifts.T) * FOCAL > 60).all()

@@ -73,7 +73,7 @@ class ClusterExecutor(Executor):
         self._looked_s, self._slots = 0.0, 0
         self._alone_since_s: float | None = None
         try:
-            self._require_alike()
+            self._require_same_versions()
         except BaseException:
             self._client.close(timeout=_connect_s())
             raise
@@ -158,7 +158,7 @@ class ClusterExecutor(Executor):
                 hint=f"install virest {__version__} with its extra [cluster] on every worker",
             ) from error
 
-    def _require_alike(self) -> None:
+    def _require_same_versions(self) -> None:
         """Refuse workers with another virest version; warn if a library version differs."""
         ours = worker_facts()
         for worker, theirs in self._ask(worker_facts).items():

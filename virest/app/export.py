@@ -113,7 +113,7 @@ def _write_scene(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> Non
         files = colmap_files(plan, poses)
     for name, text in files.items():
         _write(part / name, text)
-    _write(part / "camera.yaml", commented(_said(plan)) + format_profile(plan.profile))
+    _write(part / "camera.yaml", commented(_header_comments(plan)) + format_profile(plan.profile))
 
 
 @contextmanager
@@ -184,7 +184,7 @@ def _write_tables(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> No
         _write(part / "mav0/cam0/data.csv", format_picture_list(times))
         _write(part / "mav0/imu0/data.csv", rows)
         noise = plan.noise or ImuNoise(1.0 / median_period_s(imu.time_s), None, None)
-        _write(part / "mav0/imu0/sensor.yaml", format_imu_sensor(noise, _said(plan)))
+        _write(part / "mav0/imu0/sensor.yaml", format_imu_sensor(noise, _header_comments(plan)))
         if all(frame.exposure_s is not None for frame in frames):
             exposures = [frame.exposure_s or 0.0 for frame in frames]
             _write(part / "dso/cam0/times.txt", format_exposure_times(times, exposures))
@@ -195,7 +195,7 @@ def _write_tables(plan: ExportPlan, frames: list[ExportFrame], part: Path) -> No
         if imu.has_accelerometer:
             _write(part / "accelerometer.txt", _tum_accelerometer(plan.imu_time_ns, accel))
     _write(part / "times.txt", "".join(f"{time}\n" for time in times))
-    _write(part / "camera.yaml", commented(_said(plan)) + format_profile(plan.profile))
+    _write(part / "camera.yaml", commented(_header_comments(plan)) + format_profile(plan.profile))
     if plan.noise is not None:
         _write(part / "imu.yaml", format_imu(plan.noise, "export"))
     if plan.profile.intrinsics is not None:
@@ -211,12 +211,12 @@ def _write_calibration(plan: ExportPlan, part: Path, rate_hz: float) -> None:
     base = replace(plan.standard, intrinsics=lens, time_offset_s=0.0 if known else None)
     chain = format_camchain(base, command="export", instant_s=plan.instant_s)
     _write(part / "camchain-imucam.yaml", chain)
-    _write(part / "orb_slam3.yaml", format_orb_slam(plan.standard, rate_hz, plan.noise, _said(plan)))
+    _write(part / "orb_slam3.yaml", format_orb_slam(plan.standard, rate_hz, plan.noise, _header_comments(plan)))
     if plan.options.format == "euroc":
-        _write(part / "mav0/cam0/sensor.yaml", format_camera_sensor(plan.standard, rate_hz, _said(plan)))
+        _write(part / "mav0/cam0/sensor.yaml", format_camera_sensor(plan.standard, rate_hz, _header_comments(plan)))
 
 
-def _said(plan: ExportPlan) -> list[str]:
+def _header_comments(plan: ExportPlan) -> list[str]:
     """Comments for the written files: the kind of the frames, and the meaning of their timestamps."""
     kind = "restored by virest process" if plan.options.restored else "as recorded"
     return [

@@ -159,7 +159,7 @@ def _partial(path: Path, fault: CaptureError) -> dict[str, Any]:
         missing = [path.name for path in readers if path.name != EPOCHS and not is_present(path)]
         for path, reader in readers.items():
             if path.name not in missing:
-                _look_at(path, reader, facts, notes)
+                _add_file(path, reader, facts, notes)
         others = [name for name in missing if name not in str(fault)]
         if others:
             notes.append(Note("error", "files-missing", f"also missing: {', '.join(others)}"))
@@ -178,7 +178,7 @@ def _code(fault: CaptureError) -> str:
     return type(fault).__name__.removesuffix("Error").lower()
 
 
-def _look_at(path: Path, reader: Callable[[Path], Any], facts: dict[str, Any], notes: list[Note]) -> None:
+def _add_file(path: Path, reader: Callable[[Path], Any], facts: dict[str, Any], notes: list[Note]) -> None:
     """Add the content of one file, or why it cannot be read."""
     try:
         found = reader(path)

@@ -133,12 +133,12 @@ def plan_capture(path: str, name: str, options: ProcessOptions) -> Planned:
 def plan_elsewhere(path: str, name: str, options: ProcessOptions) -> Planned:
     """The same in a worker; log messages are collected for the capture's turn."""
     prepare_worker()
-    with _Keeper(logging.DEBUG if options.verbose else logging.INFO) as messages:
+    with _MessageCollector(logging.DEBUG if options.verbose else logging.INFO) as messages:
         planned = plan_capture(path, name, options)
     return dataclasses.replace(planned, messages=tuple(messages))
 
 
-class _Keeper(logging.Handler):
+class _MessageCollector(logging.Handler):
     """Collects the log messages of one thread; a cluster's worker may run others in the same process."""
 
     at_work = 0
@@ -149,33 +149,33 @@ class _Keeper(logging.Handler):
     def __init__(self, level: int) -> None:
         super().__init__(level)
         self.thread = threading.get_ident()
-        self.kept: list[Message] = []
+        self.messages: list[Message] = []
 
     def emit(self, record: logging.LogRecord) -> None:
         """Collect a message."""
         if record.thread == self.thread:
-            self.kept.append(Message(record.name, record.levelno, record.getMessage()))
+            self.messages.append(Message(record.name, record.levelno, record.getMessage()))
 
     def __enter__(self) -> list[Message]:
         logger = logging.getLogger("virest")
         with self.gate:
-            if not _Keeper.at_work:
-                _Keeper.level_before = logger.level
+            if not _MessageCollector.at_work:
+                _MessageCollector.level_before = logger.level
                 logger.setLevel(self.level)
-            _Keeper.at_work += 1
+            _MessageCollector.at_work += 1
         logger.addHandler(self)
-        return self.kept
+        return self.messages
 
     def __exit__(self, *_: object) -> None:
         logger = logging.getLogger("virest")
         logger.removeHandler(self)
         with self.gate:
-            _Keeper.at_work -= 1
-            if not _Keeper.at_work:
-                logger.setLevel(_Keeper.level_before)
+            _MessageCollector.at_work -= 1
+            if not _MessageCollector.at_work:
+                logger.setLevel(_MessageCollector.level_before)
 
 
-def say(messages: Sequence[Message]) -> None:
+def log_messages(messages: Sequence[Message]) -> None:
     """Log messages that were collected in a worker."""
     for message in messages:
         logging.getLogger(message.logger).log(message.level, "%s", message.text)

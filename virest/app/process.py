@@ -22,10 +22,10 @@ from virest.app.planning import (
     Job,
     Planned,
     ProcessOptions,
+    log_messages,
     plan_capture,
     plan_elsewhere,
     require_startable,
-    say,
     shown,
 )
 from virest.app.run_folder import (
@@ -139,7 +139,7 @@ def _process(slot: CaptureSlot, options: ProcessOptions, workers: Workers) -> Ca
         with console.progress_bar(None, f"{shown(slot.name)}: reading and planning", quiet=options.quiet):
             planned = slot.plan(options)
         seconds = planned.seconds if slot.ahead else time.perf_counter() - began
-        say(planned.messages)
+        log_messages(planned.messages)
         if planned.error is not None:
             if slot.ahead and isinstance(planned.error, CaptureError):
                 workers.start(locate(slot.path))  # a worker that cannot read the capture is a different error

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 @contextmanager
 def process_map(jobs: int) -> Iterator[ParallelMap]:
     """Map calls over ``jobs`` processes, started on first use; one job runs in this process."""
-    shared = _SharedOut(jobs)
+    shared = _ProcessPool(jobs)
     try:
         yield shared if jobs > 1 else one_by_one
     except BaseException:
@@ -31,7 +31,7 @@ def process_map(jobs: int) -> Iterator[ParallelMap]:
         shared.close()
 
 
-class _SharedOut:
+class _ProcessPool:
     """A pool of processes that outlives its calls."""
 
     def __init__(self, jobs: int) -> None:

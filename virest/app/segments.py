@@ -65,7 +65,7 @@ class Segment:
     """The samples that cover the frames, with a margin."""
     plan: RestorationPlan
     run: RunFolder
-    around: tuple[Frame, ...] = ()
+    neighbours: tuple[Frame, ...] = ()
     """Neighbouring frames that are decoded for joint restoration but not restored in this segment."""
     pictures: PictureOptions = PictureOptions()
 
@@ -116,13 +116,13 @@ def make_segment(
 ) -> Segment:
     """One segment, ready for a worker."""
     place, movie = RunFolder(run.path.absolute()), capture.movie.absolute()  # a worker's current folder may differ
-    around = _around(frames, capture, plan)
-    every = sorted((*frames, *around), key=lambda frame: frame.index)
+    neighbours = _neighbours(frames, capture, plan)
+    every = sorted((*frames, *neighbours), key=lambda frame: frame.index)
     imu = cut_imu(capture.imu, every, plan)
-    return Segment(name, movie, index, frames, imu, plan.of(every), place, around, pictures)
+    return Segment(name, movie, index, frames, imu, plan.of(every), place, neighbours, pictures)
 
 
-def _around(frames: tuple[Frame, ...], capture: Capture, plan: RestorationPlan) -> tuple[Frame, ...]:
+def _neighbours(frames: tuple[Frame, ...], capture: Capture, plan: RestorationPlan) -> tuple[Frame, ...]:
     """The usable neighbours, within the plan's reach, of the frames to restore."""
     own = {frame.index for frame in frames}
     restored = [frame.index for frame in frames if frame.skip_reason is None]
@@ -177,7 +177,7 @@ def _decoded(
 ) -> Iterator[tuple[Frame, Picture | None]]:
     """The segment's usable frames and their neighbours in order, each with its picture, or None if undecodable."""
     usable = [frame for frame in segment.frames if frame.skip_reason is None]
-    wanted = deque(sorted((*usable, *segment.around), key=lambda frame: frame.index))
+    wanted = deque(sorted((*usable, *segment.neighbours), key=lambda frame: frame.index))
     if not usable:
         return
     source = read_frames(segment.movie, segment.index, wanted[0].index, wanted[-1].index, steps)

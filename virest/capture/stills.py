@@ -377,10 +377,10 @@ def _groups(frames: list[Frame], iso_known: bool) -> list[list[Frame]]:
         ev = np.log2([_light(g[0], iso_known) for g in groups])
         goals = np.linspace(ev[0], ev[-1], MAX_GROUPS)
         groups = [groups[i] for i in sorted({int(np.argmin(np.abs(ev - goal))) for goal in goals})]
-    return [_spread(sorted(group, key=lambda f: f.index)) for group in groups]
+    return [_evenly_spaced(sorted(group, key=lambda f: f.index)) for group in groups]
 
 
-def _spread(group: list[Frame]) -> list[Frame]:
+def _evenly_spaced(group: list[Frame]) -> list[Frame]:
     picks = np.linspace(0, len(group) - 1, min(len(group), FRAMES_PER_GROUP)).round().astype(int)
     return [group[i] for i in picks.tolist()]
 

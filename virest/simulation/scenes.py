@@ -151,13 +151,13 @@ class ReliefScene(Scene):
         return light
 
 
-def hang_before(
+def add_near_objects(
     scene: Scene,
     rng: np.random.Generator,
     *,
     depth_m: float,
     focal_px: float,
-    things: int = 14,
+    objects: int = 14,
     size: float = 0.13,
     drift_per_s: tuple[float, float] = (0.0, 0.0),
 ) -> ReliefScene:
@@ -169,7 +169,7 @@ def hang_before(
     height, width = scene.chart.shape[:2]
     oversampling = scene.chart_focal_px / focal_px
     opacity = np.zeros((height, width), np.float32)
-    for _ in range(things):
+    for _ in range(objects):
         centre = rng.uniform((0, 0), (width, height))
         _fill_leaf(opacity, rng, centre, float(rng.uniform(0.5, 1.5)) * size * scene.chart_focal_px, 1.0)
     drawing = _draw_leaves(rng, width, height, oversampling)
@@ -182,11 +182,11 @@ def hang_before(
     )
 
 
-MOVING_LAYERS, MOVING_THINGS, MOVING_SIZE = 3, 4, 0.09
+MOVING_LAYERS, MOVING_OBJECTS, MOVING_SIZE = 3, 4, 0.09
 """Planes of moving objects, objects per plane, mean radius in units of x/z; together about 20 % of the frame."""
 
 
-def move_things_before(scene: Scene, rng: np.random.Generator, *, speed_px_s: float, focal_px: float) -> ReliefScene:
+def add_moving_objects(scene: Scene, rng: np.random.Generator, *, speed_px_s: float, focal_px: float) -> ReliefScene:
     """Add planes of objects at the scene's depth that move across it, each plane in its own direction.
 
     speed_px_s: mean speed in the image of a stationary camera of focal length focal_px; each plane's is within ±30 %.
@@ -196,8 +196,8 @@ def move_things_before(scene: Scene, rng: np.random.Generator, *, speed_px_s: fl
         angle = first + 2 * np.pi * layer / MOVING_LAYERS
         speed = speed_px_s / focal_px * float(rng.uniform(0.7, 1.3))
         drift = (speed * float(np.cos(angle)), speed * float(np.sin(angle)))
-        scene = hang_before(
-            scene, rng, depth_m=scene.depth_m, focal_px=focal_px, things=MOVING_THINGS, size=MOVING_SIZE,
+        scene = add_near_objects(
+            scene, rng, depth_m=scene.depth_m, focal_px=focal_px, objects=MOVING_OBJECTS, size=MOVING_SIZE,
             drift_per_s=drift,
         )  # fmt: skip
     assert isinstance(scene, ReliefScene)

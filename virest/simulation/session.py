@@ -28,7 +28,7 @@ from virest.simulation.hidden import NOTHING, Hidden, defocused, gyro_reading, s
 from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
-from virest.simulation.scenes import LENS_SIGMA_PX, Scene, hang_before, make_scene, move_things_before
+from virest.simulation.scenes import LENS_SIGMA_PX, Scene, add_moving_objects, add_near_objects, make_scene
 from virest.simulation.sensor import eight_bit, grey_of_light, noisy_levels, round_levels, sensor_light
 
 Array = NDArray[np.float64]
@@ -229,7 +229,7 @@ def plan_session(
         if np.isfinite(depth):
             tilt = Rotation.from_rotvec([*settings.tilt_rad, 0.0]).as_matrix()[:, 2]
             scene = _at_median_depth(scene.at_plane(depth, tuple(tilt.tolist())), motion, true, settings, shows)
-        scene = _with_things_before(scene, nominal, settings)
+        scene = _with_objects(scene, nominal, settings)
     base_ns = 1_000 * int(np.random.default_rng([settings.seed, 2]).integers(40_000_000_000, 60_000_000_000))
     ticks = np.array([_stamp_tick(k, settings.fps) for k in range(settings.frames)])
     stamps = base_ns + np.array([round(_stamp_s(k, settings.fps) * 1e9) for k in range(settings.frames)])
@@ -325,12 +325,14 @@ def _require_sizes(profile: CameraProfile, settings: SessionSettings) -> None:
     if not max(settings.exposure_s) <= LONGEST_EXPOSURE_S:
         refuse(f"an exposure of {max(settings.exposure_s):g} s", f"at most {LONGEST_EXPOSURE_S:g} s are rendered")
     if settings.moving_px_s < 0:
-        refuse(f"things that move at {settings.moving_px_s:g} px/s", "use 0 or more")
+        refuse(f"objects that move at {settings.moving_px_s:g} px/s", "use 0 or more")
     if abs(settings.pan_rad_s) > FASTEST_HAND_RAD_S:
         refuse(f"a pan of {settings.pan_rad_s:g} rad/s", f"use -{FASTEST_HAND_RAD_S:g} to {FASTEST_HAND_RAD_S:g}")
     far = scene_depth_m(profile)
     if settings.near_m is not None and not NEAREST_M <= settings.near_m < far:
-        refuse(f"things {settings.near_m:g} m away before a scene {far:g} m away", "they must be nearer than the scene")
+        refuse(
+            f"objects {settings.near_m:g} m away before a scene {far:g} m away", "they must be nearer than the scene"
+        )
     if not (settings.imu_rate_hz >= 1 and settings.noise_levels >= 0 and settings.rate_rad_s >= 0):
         refuse("a negative rate or noise", "use 0 or more")
     if settings.noise_levels > 255:
@@ -431,16 +433,16 @@ def _draw_scene(
     )
 
 
-def _with_things_before(scene: Scene, nominal: CameraProfile, settings: SessionSettings) -> Scene:
+def _with_objects(scene: Scene, nominal: CameraProfile, settings: SessionSettings) -> Scene:
     """Add the objects in front of the scene and those that move across it."""
     assert nominal.intrinsics is not None
     focal_px = max(nominal.intrinsics.fx_px, nominal.intrinsics.fy_px)
     if settings.near_m is not None:
         rng = np.random.default_rng([settings.seed, 7])
-        scene = hang_before(scene, rng, depth_m=settings.near_m, focal_px=focal_px)
+        scene = add_near_objects(scene, rng, depth_m=settings.near_m, focal_px=focal_px)
     if settings.moving_px_s:
         rng = np.random.default_rng([settings.seed, 8])
-        scene = move_things_before(scene, rng, speed_px_s=settings.moving_px_s, focal_px=focal_px)
+        scene = add_moving_objects(scene, rng, speed_px_s=settings.moving_px_s, focal_px=focal_px)
     return scene
 
 
