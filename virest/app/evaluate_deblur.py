@@ -19,13 +19,13 @@ from virest.app.difference_sheets import amplified_difference, labelled, write_s
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, read_picture, temporary_folder
 from virest.app.simulate import simulate_command
 from virest.camera.response import ResponseCurve
+from virest.capture.pixels import luma_of
 from virest.errors import CaptureError
 from virest.evaluation.baselines import BASELINES, baseline_pictures
 from virest.evaluation.burst import BURSTS, REACHES, align_frames
 from virest.evaluation.fidelity import (
     MARGIN_PX,
     fidelity,
-    grey_levels,
     inner_part,
     mean_squared_error,
     psnr_of,
@@ -86,6 +86,24 @@ class DeblurOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class ComparedFrame:
+    """One frame by every method, straightened, with its truth."""
+
+    capture: str
+    frame: str
+    pictures: Mapping[str, Picture]
+    """By method."""
+    truth: Picture
+    valid_px: Sequence[int]
+    """x0, y0, x1, y1: the rectangle with recorded data."""
+
+    @property
+    def inside(self) -> tuple[slice, slice]:
+        """Rows and columns to compare."""
+        return inner_part(self.valid_px)
+
+
+@dataclass(frozen=True, slots=True)
 class FrameResult:
     """One frame by one method."""
 
@@ -107,9 +125,9 @@ def run_deblur(options: DeblurOptions, progress: Progress | None = None) -> tupl
         total, done = sum(len(capture.frames) for capture in captures), 0
         methods = _methods_over_time if options.over_time else _all_methods
         for capture in captures:
-            for number, pictures, truth, valid_px in methods(capture):
-                results += list(_measure(capture.name, f"{number:06d}", pictures, truth, valid_px))
-                _draw(options.out, f"{capture.name}-{number:06d}", pictures, truth, valid_px)
+            for compared in methods(capture):
+                results += list(_measure(compared))
+                _draw(options.out, f"{capture.name}-{compared.frame}", compared)
                 done += 1
                 if progress:
                     progress(capture.name, done / total)
@@ -136,8 +154,8 @@ def _chosen_captures(options: DeblurOptions) -> Iterator[tuple[list[TrueCapture]
 # ── one capture ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _all_methods(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture], Picture, tuple[int, int, int, int]]]:
-    """Index, straightened picture by every method, truth and valid rectangle of each frame."""
+def _all_methods(capture: TrueCapture) -> Iterator[ComparedFrame]:
+    """Each frame by the presets and by the baselines."""
     plan = capture.plan(RestorationSettings(deblur="none"))
     plans = {BLURRED: plan} | {f"virest {name}": replace(plan, settings=preset) for name, preset in PRESETS.items()}
     curve = plan.profile.response or ResponseCurve("srgb")
@@ -149,12 +167,11 @@ def _all_methods(capture: TrueCapture) -> Iterator[tuple[int, dict[str, Picture]
         truth, valid_px = capture.truth(frame.index), restored[-1].valid_px
         ours = {name: r.picture for name, r in zip(plans, restored, strict=True) if r.picture is not None}
         peers = _baselines(recorded, motions[frame.index], curve, truth, valid_px)
-        yield frame.index, {BLURRED: ours.pop(BLURRED), **peers, **ours}, truth, valid_px
+        pictures = {BLURRED: ours.pop(BLURRED), **peers, **ours}
+        yield ComparedFrame(capture.name, f"{frame.index:06d}", pictures, truth, valid_px)
 
 
-def _methods_over_time(
-    capture: TrueCapture,
-) -> Iterator[tuple[int, dict[str, Picture], Picture, tuple[int, int, int, int]]]:
+def _methods_over_time(capture: TrueCapture) -> Iterator[ComparedFrame]:
     """As :func:`_all_methods`, for methods that merge aligned frames, and ours without and with neighbours."""
     plan = capture.plan(RestorationSettings(deblur="none"))
     settings = {SINGLE: replace(PRESETS["best"], neighbours=0)} | {
@@ -174,7 +191,8 @@ def _methods_over_time(
         aligned = align_frames(near, number, motions, trajectory, lens)
         merged = {name: _closest(merge(aligned), truth, inside) for name, merge in BURSTS.items()}
         ours = {name: r.picture for name, r in zip(plans, restored, strict=True) if r.picture is not None}
-        yield number, {BLURRED: ours.pop(BLURRED), **merged, **ours}, truth, valid_px
+        pictures_by_method = {BLURRED: ours.pop(BLURRED), **merged, **ours}
+        yield ComparedFrame(capture.name, f"{number:06d}", pictures_by_method, truth, valid_px)
 
 
 def _closest(pictures: Iterable[Picture], truth: Picture, inside: tuple[slice, slice]) -> Picture:
@@ -194,25 +212,22 @@ def _baselines(
     }
 
 
-def _measure(
-    capture: str, frame: str, pictures: Mapping[str, Picture], truth: Picture, valid_px: Sequence[int]
-) -> Iterator[FrameResult]:
-    inside = inner_part(valid_px)
-    for method, picture in pictures.items():
-        close, alike = fidelity(picture[inside], truth[inside]), count_matches(picture[inside], truth[inside])
-        yield FrameResult(capture, frame, method, close.mse, close.ssim, alike.good, alike.in_place)
+def _measure(compared: ComparedFrame) -> Iterator[FrameResult]:
+    truth = compared.truth[compared.inside]
+    for method, whole in compared.pictures.items():
+        picture = whole[compared.inside]
+        close, alike = fidelity(picture, truth), count_matches(picture, truth)
+        yield FrameResult(compared.capture, compared.frame, method, close.mse, close.ssim, alike.good, alike.in_place)
 
 
-def _draw(
-    out: Path | None, name: str, pictures: Mapping[str, Picture], truth: Picture, valid_px: Sequence[int]
-) -> None:
+def _draw(out: Path | None, name: str, compared: ComparedFrame) -> None:
     """Write the pictures above their difference maps, truth first, SHEET_COLUMNS per row."""
     if out is None:
         return
-    inside = inner_part(valid_px)
-    shown = {method: picture[inside] for method, picture in {"truth": truth, **pictures}.items()}
+    truth = compared.truth[compared.inside]
+    shown = {"truth": truth} | {method: picture[compared.inside] for method, picture in compared.pictures.items()}
     cells = [
-        labelled(method, np.concatenate([picture, amplified_difference(picture, truth[inside])]))
+        labelled(method, np.concatenate([picture, amplified_difference(picture, truth)]))
         for method, picture in shown.items()
     ]
     cells += [np.full_like(cells[0], 255)] * (-len(cells) % SHEET_COLUMNS)
@@ -238,8 +253,9 @@ def _run_folders(
         aligned, shift, shared_px = _aligned(picture, truth)
         shared_px = _common(shared_px, real_px.get(name, shared_px))
         shifts[name] = {"shift_px": [round(float(s), 4) for s in shift], "compared_px": list(shared_px)}
-        results += list(_measure(restored.name, name, {"restored": aligned}, truth, shared_px))
-        _draw(options.out, Path(name).stem, {"restored": aligned}, truth, shared_px)
+        compared = ComparedFrame(restored.name, name, {"restored": aligned}, truth, shared_px)
+        results += list(_measure(compared))
+        _draw(options.out, Path(name).stem, compared)
         if progress:
             progress(name, (position + 1) / len(names))
     facts = _facts(results, {"restored": str(restored), "reference": str(reference), "pictures": shifts})
@@ -295,7 +311,7 @@ def _aligned(picture: Picture, truth: Picture) -> tuple[Picture, NDArray[np.floa
 
 def _whole_shift(picture: Picture, truth: Picture) -> NDArray[np.float64]:
     """Shift (x, y) of the picture against its reference in whole pixels; 0 if aligning does not reduce the error."""
-    grey = [grey_levels(p).astype(np.float32) for p in (truth, picture)]
+    grey = [luma_of(p).astype(np.float32) for p in (truth, picture)]
     window = cv2.createHanningWindow(grey[0].shape[::-1], cv2.CV_32F)
     shift = np.rint(np.array(cv2.phaseCorrelate(grey[0], grey[1], window)[0]))
     if np.abs(shift).max() > min(grey[0].shape) / 4:

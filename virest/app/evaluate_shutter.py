@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from virest.app.console import cell, numeric_table
 from virest.app.difference_sheets import amplified_difference, labelled, write_sheet
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, temporary_folder
+from virest.capture.pixels import luma_of
 from virest.capture.video import read_decodable_gray
 from virest.errors import CaptureError
 from virest.evaluation.angles import Rectangle, largest_rectangle, neighbour_angles_rad, quadrilateral_angles_rad
 from virest.evaluation.board_scenes import BoardSetting, board_session
 from virest.evaluation.boards import Board, find_board, matched, plane_lattice
-from virest.evaluation.fidelity import fidelity, grey_levels, psnr_of
+from virest.evaluation.fidelity import fidelity, psnr_of
 from virest.evaluation.schubert2018 import fit_velocity, velocity_map
 from virest.image_formation.row_clock import ROW_MIDDLE, RowClock
 from virest.inference.tracking import track_pairs
@@ -201,10 +202,10 @@ def _compare(
     kind: str,
 ) -> tuple[FrameResult, tuple[slice, slice]] | None:
     """Angles and pictures of one frame, and the part of the picture around the board."""
-    board = find_board(grey_levels(truth), kind)
+    board = find_board(luma_of(truth), kind)
     if board is None:
         return None
-    lattices = {m: matched(find_board(grey_levels(picture), board.kind), board) for m, picture in pictures.items()}
+    lattices = {m: matched(find_board(luma_of(picture), board.kind), board) for m, picture in pictures.items()}
     everywhere = np.asarray(np.isfinite(np.stack([board.points_px, *lattices.values()])).all((0, -1)))
     rectangle = largest_rectangle(everywhere)
     crop = _around(board, valid_px)

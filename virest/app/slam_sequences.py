@@ -28,6 +28,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import read_profile
 from virest.capture.euroc import format_picture_list
 from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.pixels import luma_of
 from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_frames
 from virest.errors import CaptureError, SettingsError
@@ -158,7 +159,7 @@ def _pictures(
     wanted = set(numbers)
     for number, decoded in read_frames(capture.movie, probe_movie(capture.movie), numbers[0], numbers[-1]):
         if number in wanted and decoded is not None:
-            yield number, np.asarray(cv2.cvtColor(decoded, cv2.COLOR_RGB2GRAY), np.uint8)
+            yield number, luma_of(decoded)
 
 
 def _write_euroc(folder: Path, pictures: Iterator[tuple[int, NDArray[np.uint8]]], stamps_ns: dict[int, int]) -> None:

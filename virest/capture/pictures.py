@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from virest.capture.files import label, require_regular_file, scan_text
 from virest.capture.location import is_remote
 from virest.capture.marslogger_android import STAMPS, read_frame_timestamps
+from virest.capture.pixels import luma_of
 from virest.capture.tables import INTEGER, MAX_FIELDS, Int64, exact_times_ns, keep_rising, text_chunks
 from virest.errors import CaptureError, ClockError, VideoError
 
@@ -261,11 +262,7 @@ def read_pictures(
         if picture is None or (picture.shape[1], picture.shape[0]) != size:
             yield frame, None
         else:
-            yield frame, _to_gray(picture) if gray else _to_rgb(picture)
-
-
-def _to_gray(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+            yield frame, luma_of(picture) if gray else _to_rgb(picture)
 
 
 def _to_rgb(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

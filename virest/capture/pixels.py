@@ -132,7 +132,12 @@ def to_gray(frame: Any, *, centred: bool = False) -> NDArray[np.uint8]:
     """Luma (h, w) of a decoded PyAV frame, scaled to the full range; centred concerns chroma and is ignored."""
     del centred
     if frame.format.is_rgb:
-        return cv2.cvtColor(frame.to_ndarray(format="rgb24"), cv2.COLOR_RGB2GRAY)
+        return luma_of(frame.to_ndarray(format="rgb24"))
     if frame.format.name not in PLANAR_8BIT:
         frame = frame.reformat(format="yuv444p")
     return np.asarray(cv2.LUT(_planes(frame)[0], _frame_tables(frame).gray), np.uint8)
+
+
+def luma_of(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Luma of an RGB picture; a grey one unchanged."""
+    return picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.capture.pixels import luma_of
 from virest.inference.tracking import TrackingSettings, find_corners
 
 Picture = NDArray[np.uint8]
@@ -81,7 +82,7 @@ def structural_similarity(picture: Picture, truth: Picture) -> float:
 
 def difference_map(picture: Picture, truth: Picture) -> Picture:
     """|picture − truth| of the luma (height, width); black where they agree (the paper's Figure 19)."""
-    return np.asarray(cv2.absdiff(grey_levels(picture), grey_levels(truth)), np.uint8)
+    return np.asarray(cv2.absdiff(luma_of(picture), luma_of(truth)), np.uint8)
 
 
 def psnr_db(picture: Picture, truth: Picture, valid_px: Sequence[int], margin_px: int = MARGIN_PX) -> float:
@@ -98,7 +99,7 @@ def inner_part(valid_px: Sequence[int], margin_px: int = MARGIN_PX) -> tuple[sli
 
 def point_distances_px(picture: Picture, truth: Picture, valid_px: Sequence[int]) -> Array:
     """Displacements (n,) of the truth's corners in the picture, by Lucas–Kanade with a forward–backward check."""
-    grey_truth, grey = (grey_levels(p) for p in (truth, picture))
+    grey_truth, grey = (luma_of(p) for p in (truth, picture))
     points = find_corners(grey_truth, TRACKING)
     found, forward = _follow(grey_truth, grey, points)
     returned, backward = _follow(grey, grey_truth, forward)
@@ -132,13 +133,8 @@ def _windowed(plane: Array) -> Array:
     return np.asarray(near[SSIM_RADIUS_PX:-SSIM_RADIUS_PX, SSIM_RADIUS_PX:-SSIM_RADIUS_PX])
 
 
-def grey_levels(picture: Picture) -> Picture:
-    """Luma of an RGB picture; a grey one unchanged."""
-    return picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
 def _smooth_grey(picture: Picture) -> NDArray[np.float32]:
-    return np.asarray(cv2.GaussianBlur(grey_levels(picture).astype(np.float32), (0, 0), SHIFT_SMOOTHING_PX), np.float32)
+    return np.asarray(cv2.GaussianBlur(luma_of(picture).astype(np.float32), (0, 0), SHIFT_SMOOTHING_PX), np.float32)
 
 
 def _follow(

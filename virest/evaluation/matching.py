@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.evaluation.fidelity import grey_levels
+from virest.capture.pixels import luma_of
 
 Picture = NDArray[np.uint8]
 RATIO = 0.75
@@ -49,7 +49,7 @@ def count_matches(picture: Picture, truth: Picture) -> Matches:
 def _described(picture: Picture) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Positions (n, 2) and descriptors (n, 128) of an image's features."""
     detector = cv2.SIFT_create()  # type: ignore[attr-defined]
-    points, descriptors = detector.detectAndCompute(grey_levels(picture), None)
+    points, descriptors = detector.detectAndCompute(luma_of(picture), None)
     if descriptors is None:
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
     return np.array([p.pt for p in points], np.float32), descriptors

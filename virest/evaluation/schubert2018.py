@@ -55,7 +55,11 @@ def fit_velocity(
     d = v(p) Δt, Δt between the mid-exposures of the rows that see the point.  middle_s: mid-exposure of the first row,
     by frame.  Robust: iteratively reweighted least squares (Cauchy).
     """
-    found = [_displacements(pair, frame, middle_s, shutter, width, height) for pair in pairs if frame in _both(pair)]
+    found = [
+        _displacements(pair, frame, middle_s, shutter, width, height)
+        for pair in pairs
+        if frame in (pair.first, pair.second)
+    ]
     if not found or sum(len(points) for points, _, _ in found) < MIN_POINTS:
         return None
     points, moved, passed_s = (np.concatenate(parts) for parts in zip(*found, strict=True))
@@ -84,10 +88,6 @@ def velocity_map(
         passed_s = row_time_s(since_reference_s, shutter.readout_time_s, shutter.readout_fraction(seen, width, height))
         seen = pixels + speed * passed_s[..., None]
     return seen.astype(np.float32)
-
-
-def _both(pair: TrackPair) -> tuple[int, int]:
-    return pair.first, pair.second
 
 
 def _displacements(
