@@ -67,14 +67,7 @@ def run_account(
     notes = [note.text for note in job.capture.notes if note.severity != "info"]
     counts = totals["counts"]
     return {
-        "virest_run": 1,
-        "version": __version__,
-        "transforms": transforms.in_use(),
-        "capture": job.name,
-        "status": "done",
-        "exit_code": PARTLY_FAILED if counts["failed"] else 0,
-        "failure": None,
-        "source": _source(job.path),
+        **_head(job.path, job.name, PARTLY_FAILED if counts["failed"] else 0),
         "folder": str(job.capture.folder.absolute()),
         "movie": str(job.capture.movie.absolute()),
         "command": job.request["command"],
@@ -102,14 +95,7 @@ def failure_account(
     kind = type(error).__name__
     known = error if isinstance(error, VirestError) else VirestError(f"{kind}: {error}", hint=console.OUR_FAULT)
     return {
-        "virest_run": 1,
-        "version": __version__,
-        "transforms": transforms.in_use(),
-        "capture": name,
-        "status": "failed",
-        "exit_code": known.exit_code,
-        "failure": {"error": kind, "reason": known.message, "hint": known.hint},
-        "source": _source(path),
+        **_head(path, name, known.exit_code, {"error": kind, "reason": known.message, "hint": known.hint}),
         "folder": str(locate(path).absolute()),
         "movie": str(job.capture.movie.absolute()) if job else None,
         "command": options.command,
@@ -127,9 +113,18 @@ def failure_account(
     }
 
 
-def _source(path: str) -> dict[str, str]:
-    """The capture's path as given, and with links resolved."""
-    return {"given": path, "resolved": resolved(path)}
+def _head(path: str, name: str, exit_code: int, failure: dict[str, str | None] | None = None) -> dict[str, Any]:
+    """What every run.json begins with; source: the capture's path as given, and with links resolved."""
+    return {
+        "virest_run": 1,
+        "version": __version__,
+        "transforms": transforms.in_use(),
+        "capture": name,
+        "status": "done" if failure is None else "failed",
+        "exit_code": exit_code,
+        "failure": failure,
+        "source": {"given": path, "resolved": resolved(path)},
+    }
 
 
 def _facts_of_folder(folder: Path) -> list[dict[str, Any]]:

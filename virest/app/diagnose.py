@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.app.diagnosis_text import SHOWN_COMPONENTS, describe
+from virest.app.diagnosis_text import describe
 from virest.app.field_record import field_record
 from virest.app.outputs import capture_name, json_text, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
@@ -37,6 +37,7 @@ from virest.errors import OutputError, VirestError
 from virest.inference.parallel import ParallelMap, begun, one_by_one
 from virest.report.field_figures import field_figure
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
+from virest.report.words import SHOWN_COMPONENTS
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.settings import PRESETS
 from virest.simulation.recreation import recreate_session

@@ -20,7 +20,7 @@ _FILTER_UP = 2
 _COLOUR_TYPES = {1: 0, 3: 2}
 """PNG's colour type by number of channels: greyscale, truecolour."""
 MOST_PX = 2**31 - 1
-"""Width and height are 31-bit integers (PNG specification, 11.2.1)."""
+"""Width and height are 31-bit integers (PNG specification, 7.1)."""
 
 
 def png_bytes(picture: NDArray[np.uint8]) -> bytes:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.simulate import recording_facts
 from virest.camera.profile import CameraProfile
@@ -32,7 +31,6 @@ from virest.simulation.session import SessionSettings
 
 log = logging.getLogger(__name__)
 
-Picture = NDArray[np.uint8]
 Json = dict[str, Any]
 NEAREST_PART = 0.25
 """The scene is the frame with the least motion among this fraction of frames, those nearest the mean view."""

@@ -21,8 +21,11 @@ from typing import Any
 from virest.capture.euroc import LIST, find_euroc, read_euroc, read_imu_rows
 from virest.capture.gyroflow import GCSV, read_gyroflow
 from virest.capture.marslogger_android import (
+    GYRO,
     IOS_ARKIT,
     IOS_METADATA,
+    METADATA,
+    STAMPS,
     identify,
     read_edge_epochs,
     read_frame_timestamps,
@@ -37,7 +40,7 @@ from virest.capture.pictures import MOVIE_SUFFIXES, find_picture_source
 from virest.capture.records import Note
 from virest.capture.rosbag import is_bag
 from virest.capture.sensor_logger import is_sensor_logger, read_sensor_logger
-from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source, list_names
+from virest.capture.source import EPOCHS, MOVIE, Source, list_names
 from virest.capture.stray_scanner import is_stray_scanner, read_stray_scanner
 from virest.capture.telemetry import read_telemetry
 from virest.capture.video import probe_movie

@@ -29,11 +29,12 @@ from virest.capture.join import (
 )
 from virest.capture.location import locate
 from virest.capture.logged_focal import focal_scales
+from virest.capture.marslogger_android import GYRO, METADATA, STAMPS
 from virest.capture.profile_source import default_profile, resolve_profile
 from virest.capture.recorder_metadata import summarise
 from virest.capture.records import IMU_GAP, NO_IMU, NO_STAMP, STALL, STARTUP, Capture, CaptureMetadata, Frame, Note
 from virest.capture.rosbag import ENDINGS as BAG_ENDINGS
-from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, Source
+from virest.capture.source import EPOCHS, MOVIE, Source
 from virest.capture.tables import GyroTable, MetadataTable, StampTable
 from virest.capture.video import read_gray
 from virest.errors import CaptureError, ClockError, ImuError

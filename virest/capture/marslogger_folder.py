@@ -6,13 +6,16 @@ from pathlib import Path
 
 from virest.capture.files import is_present, require_regular_file
 from virest.capture.marslogger_android import (
+    GYRO,
+    METADATA,
+    STAMPS,
     read_edge_epochs,
     read_frame_timestamps,
     read_gyro_accel,
     read_movie_metadata,
 )
 from virest.capture.records import Note
-from virest.capture.source import EPOCHS, GYRO, METADATA, MOVIE, STAMPS, UNFINISHED, Source, present
+from virest.capture.source import EPOCHS, MOVIE, UNFINISHED, Source, present
 from virest.capture.tables import EdgeEpochs, MetadataTable, StampTable
 from virest.capture.video import probe_movie
 from virest.errors import ClockError

@@ -22,11 +22,11 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.files import is_present, label, scan_text
 from virest.capture.join import COARSEST_TICK_NS, align_frames, match_times, pts_tolerance_ns
-from virest.capture.marslogger_android import normalised_columns, read_gyro_accel
+from virest.capture.marslogger_android import GYRO, METADATA, normalised_columns, read_gyro_accel
 from virest.capture.phone_tables import G_M_S2
 from virest.capture.profile_source import phone_profile
 from virest.capture.records import Note
-from virest.capture.source import GYRO, METADATA, FileNames, Source, find_movie
+from virest.capture.source import FileNames, Source, find_movie
 from virest.capture.tables import (
     Float64,
     GyroTable,

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from virest.capture.euroc import note_missing_pictures, read_imu_rows
 from virest.capture.files import is_present, label
-from virest.capture.marslogger_android import read_edge_epochs, read_gyro_accel, read_movie_metadata
+from virest.capture.marslogger_android import GYRO, METADATA, read_edge_epochs, read_gyro_accel, read_movie_metadata
 from virest.capture.pictures import find_picture_source, read_picture_list
 from virest.capture.records import Note
-from virest.capture.source import EPOCHS, GYRO, METADATA, ONE_CLOCK, FileNames, Source, present
+from virest.capture.source import EPOCHS, ONE_CLOCK, FileNames, Source, present
 from virest.capture.tables import MetadataTable, StampTable
 from virest.capture.video import index_pictures
 from virest.errors import VideoError

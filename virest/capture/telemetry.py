@@ -14,9 +14,10 @@ import numpy as np
 
 from virest.capture.files import label
 from virest.capture.gyroflow import film_profile, note_unknown_exposure
+from virest.capture.marslogger_android import GYRO
 from virest.capture.phone_tables import movie_stamps
 from virest.capture.records import Note
-from virest.capture.source import GYRO, ORIGIN_NS, FileNames, Source, find_movie
+from virest.capture.source import ORIGIN_NS, FileNames, Source, find_movie
 from virest.capture.tables import Float64, GyroTable, keep_rising, make_gyro_table
 from virest.capture.video import probe_movie
 from virest.errors import ImuError, one_line

@@ -51,8 +51,6 @@ class SfmPath:
     """(n, 4) w x y z."""
     points: int
     """Number of scene points."""
-    reprojection_px: float
-    """Mean reprojection error."""
 
 
 def require_pycolmap() -> Any:
@@ -114,7 +112,7 @@ def find_path(database: Path, work: Path, seed: int, settings: SfmSettings) -> S
     colmap.geometric_verification(verified, verifier, two_view_geometry_options=two_view)
     models = colmap.incremental_mapping(verified, run_folder, run_folder, _mapping(colmap, seed, settings))
     if not models:
-        return SfmPath((), np.empty((0, 3)), np.empty((0, 4)), 0, float("nan"))
+        return SfmPath((), np.empty((0, 3)), np.empty((0, 4)), 0)
     return _path(max(models.values(), key=lambda model: model.num_reg_images()))
 
 
@@ -150,5 +148,4 @@ def _path(model: Any) -> SfmPath:
         np.array([image.projection_center() for image in posed]).reshape(-1, 3),
         np.array([turn.as_quat(scalar_first=True) for turn in rotation]).reshape(-1, 4),
         len(model.points3D),
-        float(model.compute_mean_reprojection_error()),
     )

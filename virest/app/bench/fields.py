@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 Row = dict[str, Any]
 Draw = Callable[[np.random.Generator, float], "UnknownEffect"]
 SIZE, SMALL, FPS = (640, 480), (480, 360), 30.0
-"""Frame, the smaller frame of the other captures, and frame rate."""
+"""Frame with an unknown effect, the smaller frame of captures without one, and frame rate."""
 FRAMES, FRAMES_OF_OTHER = 96, 50
 """3.2 s to diagnose, and 1.7 s of another capture in which the found field is tested."""
 FIRST_SEED, FIRST_NULL = 7100, 8100
