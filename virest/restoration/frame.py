@@ -380,7 +380,10 @@ def _details(
     model = measured.luma_model
     ideal, alone = model.ideal_error(joined.passed), model.ideal_error(np.zeros_like(joined.passed))
     misplaced = model.misplaced(blur.position_std_px, joined.passed)
-    gain_db = None if confirmed is None else confirmed.of_change_db(changed, model.blur_error, ideal, misplaced)
+    gain_db = None
+    if confirmed is not None:
+        colour = measured.chroma.colour_error()
+        gain_db = confirmed.of_change_db(changed, model.blur_error, ideal, misplaced, colour)
     return Deblurring(
         method=settings.deblur,
         preset=settings.preset,
