@@ -273,6 +273,11 @@ class PictureStatistics:
         return max(per_power * self.blur_error - left, 0.0), left
 
     @property
+    def colour_noise_levels(self) -> float:
+        """Standard deviation, grey levels, of red, green and blue by the noise of colour differences."""
+        return float(np.sqrt(PER_COLOUR_POWER * self._area() @ self.noise)) if self.measured else 0.0
+
+    @property
     def blur_error(self) -> float:
         """Mean square error, grey levels squared, of the recorded picture by its blur."""
         return float(self._area() @ self._blur_loss())
