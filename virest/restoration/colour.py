@@ -43,6 +43,8 @@ FIELD_SAMPLES, LIGHT_STEPS = (6, 5), 2
 """Rows and columns of the grid on which paths are computed to correct light, and number of corrections.
 
 The first gains 0.1 to 0.35 dB, the second up to 0.1, two more up to 0.05 or lose as much (three captures)."""
+LEAST_LIGHT = 1e-6
+"""Keeps divisors above 0; the darkest grey level is 3e-4."""
 NEARBY_SIDE, FINE_SIDE = 5, 3
 """Sides, in pixels of the colour differences, of the squares for their regression on the luma: for blurred pictures, in
 addition to the path on both sides, and for sharp ones."""
@@ -64,7 +66,7 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
         [cv2.add(luma, difference) for difference in _three_differences(*differences)]
         for luma, differences in (recorded, (small, red_blue))
     )
-    small_grey, *differences = _grey_differences(blurred, small, _consistent_light(blurred, seen, light, scale))
+    small_grey, *differences = _grey_differences(blurred, small, _consistent_light(blurred, small, seen, light, scale))
     slopes = _regression_slopes(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
     rests = [cv2.subtract(d, cv2.multiply(s, small_grey)) for d, s in zip(differences, slopes, strict=True)]
 
@@ -203,7 +205,7 @@ def _grey_differences(blurred: BlurredPicture, luma: Image, channels: Sequence[I
 
 
 def _consistent_light(
-    blurred: BlurredPicture, recorded: list[Image], restored: list[Image], scale: int
+    blurred: BlurredPicture, luma: Image, recorded: list[Image], restored: list[Image], scale: int
 ) -> Sequence[Image]:
     """Restored light of the channels, (height, width) each, made non-negative and consistent with what was recorded.
 
@@ -211,7 +213,8 @@ def _consistent_light(
     a green leaf, is then too bright, and the tone curve's steep slope shows the ringing as stripes.  Each of
     Richardson–Lucy's steps corrects the light by the ratio of what was recorded to what it would record, and leaves
     alone what agrees.  The noise of the recorded light is added to both sides of the ratio; light that was not measured
-    corrects nothing.  All are ``scale`` times smaller than the picture.
+    corrects nothing.  The luma, restored with a better prior, stays as it is.  All are ``scale`` times smaller than the
+    picture.
     """
     seen, light = cv2.merge(recorded), cv2.max(cv2.merge(restored), 0.0)
     if blurred.longest_px < scale:
@@ -225,7 +228,9 @@ def _consistent_light(
         if measured is not None:
             ratio = 1 + measured * (ratio - 1)
         light = cv2.multiply(light, unblur(ratio))
-    return cv2.split(light)
+    channels = cv2.split(light)
+    brighter = cv2.divide(cv2.max(luma, 0.0), cv2.max(luma_of(list(channels)), LEAST_LIGHT))
+    return [cv2.multiply(channel, brighter) for channel in channels]
 
 
 def _blur_along_paths(

@@ -58,13 +58,14 @@ class ConfirmedGain:
         """The expected gain, dB, given the model's predicted gain, before a frame is restored."""
         return _gain_db(min(self.share, 1.0) * (1 - 10 ** (-promised_db / 10)))
 
-    def taken(self, further: float) -> float:
+    @property
+    def taken(self) -> float:
         """The fraction of the change that leaves the least error.
 
-        further: sum of the weights of the neighbours restored with the frame.  Errors of the frames' kernels are
-        independent, so the wrong part of the change falls with their number.
+        It holds for frames restored with neighbours too: what is wrong with a phone's kernels (its tone curve, the
+        gyroscope's low pass) is wrong in all frames.
         """
-        return float(np.clip(1 - 0.5 * (1 - self.share) / (1 + further), 0.0, 1.0))
+        return float(np.clip(0.5 * (1 + self.share), 0.0, 1.0))
 
     def of_change_db(
         self,
