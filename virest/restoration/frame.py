@@ -382,7 +382,7 @@ def _details(
     misplaced = model.misplaced(blur.position_std_px, joined.passed)
     gain_db = None
     if confirmed is not None:
-        colour = measured.chroma.colour_error(joined.passed)
+        colour = measured.chroma.colour_error()
         gain_db = confirmed.of_change_db(changed, model.blur_error, ideal, misplaced, colour)
     return Deblurring(
         method=settings.deblur,

@@ -22,7 +22,7 @@ from virest.errors import SettingsError
 
 log = logging.getLogger(__name__)
 
-KINDS = ("leaves", "bright", "board", "text", "photographs")
+KINDS = ("leaves", "colours", "bright", "board", "text", "photographs")
 LENS_SIGMA_PX = 0.5
 MAX_CHART_PX = 36_000_000
 PHOTOGRAPHS = ("astronaut", "chelsea", "coffee", "rocket")
