@@ -304,6 +304,7 @@ def _joined(
     ratio: float = 1e-3,
     trust: Image | None = None,
     weight: float = 1.0,
+    variance: float | None = None,
 ) -> TileDeconvolution:
     """Tiles of a picture to which a further one was joined; trust: None: everywhere."""
     grid = tile_grid(*picture.shape, 64, 16)
@@ -312,7 +313,8 @@ def _joined(
     sharp, noise = (np.full((deconvolution.size,) * 2, value, np.float32) for value in (sharpness, ratio))
     trust = np.ones_like(picture) if trust is None else trust
     kept = [(sharp, 1 - sharp * sharp)] * count
-    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), kept, trust, weight)
+    spread = None if variance is None else np.full((deconvolution.size,) * 2, variance, np.float32)
+    other = FurtherPicture([further], np.repeat(its_kernel[None], count, 0), kept, trust, weight, spread)
     deconvolution.join([picture], [other], noise)
     return deconvolution
 
@@ -368,6 +370,15 @@ def test_a_neighbour_whose_place_is_uncertain_weighs_less() -> None:
     """What is left of it on average, s, makes (1 - s^2) |K|^2 of the signal an error of its own."""
     picture, across, down = texture(100, 150).astype(np.float32), _stroke(True), _stroke(False)
     known, uncertain = (_joined(picture, across, picture, down, sharpness).powers for sharpness in (1.0, 0.5))
+    alone = TileDeconvolution(tile_grid(100, 150, 64, 16), np.repeat(across[None], len(known), 0), 16).powers
+    gain_known, gain_uncertain = (float((powers - alone).clip(0).sum()) for powers in (known, uncertain))
+    assert 0 < gain_uncertain < 0.2 * gain_known
+
+
+def test_a_neighbour_whose_kernel_is_uncertain_weighs_less() -> None:
+    """Its kernel's variance makes an error of as much of the signal; most of its weight goes, and none of its power."""
+    picture, across, down = texture(100, 150).astype(np.float32), _stroke(True), _stroke(False)
+    known, uncertain = (_joined(picture, across, picture, down, variance=v).powers for v in (None, 0.1))
     alone = TileDeconvolution(tile_grid(100, 150, 64, 16), np.repeat(across[None], len(known), 0), 16).powers
     gain_known, gain_uncertain = (float((powers - alone).clip(0).sum()) for powers in (known, uncertain))
     assert 0 < gain_uncertain < 0.2 * gain_known

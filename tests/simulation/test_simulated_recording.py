@@ -235,7 +235,7 @@ def test_sizes_that_no_camera_has_are_refused_in_one_line(simulate, asked, said)
         simulate("impossible", **asked)
 
 
-@pytest.mark.parametrize("scene", ["bright", "board", "text", "photographs"])
+@pytest.mark.parametrize("scene", ["colours", "bright", "board", "text", "photographs"])
 def test_every_scene_can_be_filmed(scene, simulate):
     """Each kind gives pictures with contrast; the bright one clips a few percent."""
     truth = read_truth(simulate(scene, scene=scene, frames=1, depth_m=1.2, tilt_deg=(10.0, -5.0)))

@@ -364,7 +364,7 @@ def _blend_weights(
         height, width = blurred.light[0].shape
         part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)
     if confirmed is not None:
-        part = part * np.float32(confirmed.taken(sum(one.weight for one in joined.registrations)))
+        part = part * np.float32(confirmed.taken)
     return touched, part
 
 
@@ -380,7 +380,10 @@ def _details(
     model = measured.luma_model
     ideal, alone = model.ideal_error(joined.passed), model.ideal_error(np.zeros_like(joined.passed))
     misplaced = model.misplaced(blur.position_std_px, joined.passed)
-    gain_db = None if confirmed is None else confirmed.of_change_db(changed, model.blur_error, ideal, misplaced)
+    gain_db = None
+    if confirmed is not None:
+        colour = measured.chroma.colour_error()
+        gain_db = confirmed.of_change_db(changed, model.blur_error, ideal, misplaced, colour)
     return Deblurring(
         method=settings.deblur,
         preset=settings.preset,

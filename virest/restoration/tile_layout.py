@@ -158,7 +158,9 @@ def join_neighbours(
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
         if highlights is not None:
             trust[cv2.resize(highlights, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
-        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, one.coding_noise_ratio))
+        variance = None if one.spread is None else packed(one.spread.variance(deconvolution.size, 1 / scale))
+        weight = one.coding_noise_ratio
+        further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, weight, variance))
     deconvolution.join(own, further, ratio, factors)
 
 

@@ -48,6 +48,8 @@ class FurtherPicture:
     """(height, width) 0 to 1."""
     weight: float = 1.0
     """Multiplies the trust."""
+    variance: Image | None = None
+    """Var K on a packed spectrum; None: exact kernels."""
 
 
 LEAST_RATIO = 1e-12
@@ -142,8 +144,9 @@ class TileDeconvolution:
     ) -> None:
         """Add further pictures of the same scene to the data term; channels (height, width) of the tiles' own picture.
 
-        Registration error acts as extra noise, (1 − s²) |K|² of the signal, beside the frame's own, N / S ``ratio``,
-        and reduces the further picture's weight accordingly.  Its power |K|² stays, as in any expected data term.  A
+        Registration error acts as extra noise, (1 − s²) |K|² of the signal, and so does the kernel's variance, beside
+        the frame's own, N / S ``ratio``; both reduce the further picture's weight.  Its power E|K|² stays, as in any
+        expected data term.  A
         tile weighs by its mean trust.  Untrusted pixels are replaced by the linear filter's estimate from the pictures
         joined so far, blurred by the further picture's kernel, which adds no information; so pictures that are trusted
         all over a tile are joined first.
@@ -298,7 +301,7 @@ class _Joining:
     """A further picture while it is being joined to the tiles."""
 
     def __init__(self, tiles: TileDeconvolution, picture: FurtherPicture) -> None:
-        self._tiles, self._sharpness = tiles, picture.sharpness
+        self._tiles, self._sharpness, self._variance = tiles, picture.sharpness, picture.variance
         self._padded, self._trusted = [tiles.padded(c) for c in picture.channels], tiles.padded(picture.trust)
         self._corners, patch = list(tiles.grid.corners()), tiles.patch
         parts = [self._trusted[top : top + patch, left : left + patch] for top, left in self._corners]
@@ -338,6 +341,9 @@ class _Joining:
         ratio, least = ratios
         _whole_power(kernel, one)
         cv2.add(cv2.multiply(lost, one, weight), least, weight)
+        if self._variance is not None:
+            cv2.add(weight, self._variance, weight)
+            cv2.add(one, self._variance, one)
         cv2.divide(ratio, weight, weight, self._weights[number])
         cv2.accumulateProduct(one, weight, power)
         cv2.multiply(kernel, cv2.multiply(sharpness, weight, weight), kernel)

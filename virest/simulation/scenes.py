@@ -22,7 +22,7 @@ from virest.errors import SettingsError
 
 log = logging.getLogger(__name__)
 
-KINDS = ("leaves", "bright", "board", "text", "photographs")
+KINDS = ("leaves", "colours", "bright", "board", "text", "photographs")
 LENS_SIGMA_PX = 0.5
 MAX_CHART_PX = 36_000_000
 """0.4 GB as 32-bit RGB."""
@@ -246,6 +246,12 @@ def _draw_leaves(rng: np.random.Generator, width: int, height: int, scale: float
     return np.clip(_textured(rng, labels, colour), 0.004, 0.9)
 
 
+def _draw_colours(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
+    """Dead leaves of saturated colours: print, toys, clothes."""
+    labels, count = _leaf_labels(rng, width, height, scale)
+    return np.clip(_textured(rng, labels, _saturated_colours(rng, count)), 0.004, 0.9)
+
+
 def _draw_bright(rng: np.random.Generator, width: int, height: int, scale: float) -> NDArray[Any]:
     """Dead leaves with highlights of 1.5 to 12 times the clip level on about 3 % of the area."""
     light = _draw_leaves(rng, width, height, scale)
@@ -340,6 +346,7 @@ _SRGB_LIGHT = np.where(
 """Linear light of each 8-bit sRGB level (IEC 61966-2-1)."""
 _DRAWINGS = {
     "leaves": _draw_leaves,
+    "colours": _draw_colours,
     "bright": _draw_bright,
     "board": _draw_board,
     "text": _draw_text,
@@ -392,6 +399,11 @@ def _natural_colours(rng: np.random.Generator, count: int) -> NDArray[Any]:
     yellow, red = rng.normal(0, 0.22, count), rng.normal(0, 0.09, count)
     tint = np.exp(np.stack([0.5 * yellow + red, 0.15 * yellow - 0.5 * red, -yellow], axis=1))
     return (luminance[:, None] * tint).astype(np.float32)
+
+
+def _saturated_colours(rng: np.random.Generator, count: int) -> NDArray[Any]:
+    """Linear RGB (count, 3): channels independent and even over the grey levels of sRGB, as of printed inks."""
+    return _SRGB_LIGHT[rng.integers(10, 246, (count, 3))]
 
 
 def _textured(rng: np.random.Generator, labels: NDArray[np.int32], colour: NDArray[Any]) -> NDArray[Any]:

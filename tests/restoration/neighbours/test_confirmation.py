@@ -37,8 +37,8 @@ def test_the_part_taken_leaves_the_least_error():
     found = confirmed_gain([(fall, (changed**2).mean(), 0.02, 0.01)] * 2)
     assert found is not None
     errors = {part: ((lacked - part * changed) ** 2).mean() for part in np.linspace(0, 1, 101)}
-    assert found.taken(0.0) == pytest.approx(min(errors, key=errors.__getitem__), abs=0.011)
-    assert found.taken(0.0) < found.taken(2.0) < 1.0
+    assert found.taken == pytest.approx(min(errors, key=errors.__getitem__), abs=0.011)
+    assert found.taken < 1.0
 
 
 def test_a_change_for_the_worse_promises_nothing():
@@ -63,6 +63,15 @@ def test_a_larger_change_promises_more_and_a_larger_rest_less():
     assert all(0 < gain_db < much[0] for gain_db, _ in less)
     assert all(deviation > 0 for _, deviation in (much, *less))
     assert found.of_change_db(0.0, 80.0, 30.0)[0] == 0.0
+
+
+def test_colour_that_stays_blurred_promises_less_and_colour_that_is_removed_more():
+    """Saturated scenes have as much error in colour as in luma."""
+    found = ConfirmedGain(1.0, 0.2, 0.02, 4)
+    grey, stays, goes = (
+        found.of_change_db(50.0, 80.0, 30.0, colour=colour)[0] for colour in ((0.0, 0.0), (0.0, 100.0), (100.0, 0.0))
+    )
+    assert stays < grey < goes
 
 
 def test_rows_that_lie_wrong_promise_less():

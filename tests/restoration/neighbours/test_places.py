@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from virest.restoration.neighbours.joint import _common_shift_px, _cubic_error, _trust, is_detailed
+from virest.restoration.neighbours.joint import _common_shift_px, _cubic_error, _shift_field, _trust, is_detailed
 from virest.restoration.neighbours.reduced_tiles import AROUND, TILE, WIDE, wide_spectra
 from virest.restoration.neighbours.registration import TileAgreement
 from virest.restoration.statistics.records import unknown_picture
@@ -70,6 +70,35 @@ def _agreement(near_shift_px: float, rng: np.random.Generator) -> TileAgreement:
         np.ones((WIDE, WIDE // 2 + 1)),
         1,
     )
+
+
+def _field_of(shift_px: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The shift field at the tiles' centres, and its deviation, from the tiles' measured shifts."""
+    some = replace(_agreement(0.0, rng), centres_px=CENTRES_PX, shift_px=shift_px, precision=np.ones(len(shift_px)))
+    field, _, std_px = _shift_field(some, np.ones(len(shift_px), bool))
+    return field.at(CENTRES_PX), std_px
+
+
+@pytest.mark.parametrize("size_px", [0.0, 0.1, 0.4])
+def test_the_field_follows_a_smooth_rest_within_its_deviation(rng: np.random.Generator, size_px: float) -> None:
+    """Closer than the tiles' noise where the rest is larger, and no further than it where there is none."""
+    true = size_px * np.sin(2 * np.pi * CENTRES_PX / (9 * SPACING_PX)) + 0.001 * CENTRES_PX
+    errors, deviations = [], []
+    for _ in range(30):
+        found, std_px = _field_of(true + rng.normal(0, 0.1, true.shape), rng)
+        errors.append(found - true)
+        deviations.append(std_px)
+    error_px, std_px = (float(np.sqrt(np.mean(np.square(all_)))) for all_ in (errors, deviations))
+    assert error_px < (0.09 if size_px else 0.04)
+    assert 0.5 < error_px / std_px < 1.6, "rather wide for a field smoother than the tiles"
+
+
+def test_one_tile_that_shows_something_else_does_not_bend_the_field(rng: np.random.Generator) -> None:
+    """A tile 3 px off moves the field beside it by less than the tiles' noise."""
+    measured = rng.normal(0, 0.05, CENTRES_PX.shape)
+    moved = measured.copy()
+    moved[50] += 3.0
+    assert np.abs(_field_of(moved, rng)[0] - _field_of(measured, rng)[0]).max() < 0.1
 
 
 def test_relief_that_lies_elsewhere_weighs_little(rng: np.random.Generator) -> None:

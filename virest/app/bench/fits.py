@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 Row = dict[str, Any]
 OTHER_SEEDS = 1000
 """Added to the seeds of the test captures."""
-LEFT_OVER_NAMES = ("constant", "ideal filter's", "neighbours'")
+LEFT_OVER_NAMES = ("constant", "ideal filter's", "neighbours'", "colour's")
 LEFT_OVER_PRESETS = ("fast", "balanced")
 OUTLYING_DB = 0.5
 """Error of the predicted gain at which the soft-L1 loss departs from the square."""
@@ -85,8 +85,8 @@ def fit_workloads(scale: Scale) -> list[Workload]:
 def fit_left_over(rows: Sequence[Row]) -> Row:
     """Fit the coefficients of :data:`confirmation.LEFT_OVER` to the gains: values, standard deviations and scatter.
 
-    rows: with ``capture``, ``removed``, ``misplaced``, ``logarithms`` (1, ln ideal, ln left) and ``gain_db``.  Captures
-    have equal weight.
+    rows: with ``capture``, ``removed``, ``misplaced``, ``regressors`` (1, ln ideal, ln left, colour's) and
+    ``gain_db``.  Captures have equal weight.
     """
     captures = np.array([row["capture"] for row in rows])
     names = list(dict.fromkeys(captures.tolist()))
@@ -94,7 +94,7 @@ def fit_left_over(rows: Sequence[Row]) -> Row:
     left_out = [_fitted([r for r in rows if r["capture"] != n], captures[captures != n]) for n in names]
     std = np.sqrt((len(names) - 1) * np.var(left_out, axis=0)) if len(names) > 1 else np.full(len(fitted), np.nan)
     off_db = np.abs(_promised_db(rows, fitted) - [row["gain_db"] for row in rows])
-    slopes = (_promised_db(rows, fitted - (0.05, 0, 0)) - _promised_db(rows, fitted)) / 0.05
+    slopes = (_promised_db(rows, fitted - (0.05, 0, 0, 0)) - _promised_db(rows, fitted)) / 0.05
     return {
         "coefficients": fitted.tolist(),
         "std": std.tolist(),
@@ -121,13 +121,18 @@ def best_value(values: Sequence[float], gains_db: Array) -> Row:
 class _RecordingGain(ConfirmedGain):
     """A ConfirmedGain that records the arguments of its calls."""
 
-    asked: list[tuple[float, float, float, Misplaced]] = field(default_factory=list)
+    asked: list[tuple[float, float, float, Misplaced, tuple[float, float]]] = field(default_factory=list)
 
     def of_change_db(
-        self, changed: float, lost: float, ideal: float, misplaced: Misplaced = confirmation.IN_PLACE
+        self,
+        changed: float,
+        lost: float,
+        ideal: float,
+        misplaced: Misplaced = confirmation.IN_PLACE,
+        colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
-        self.asked.append((changed, lost, ideal, misplaced))
-        return ConfirmedGain.of_change_db(self, changed, lost, ideal, misplaced)
+        self.asked.append((changed, lost, ideal, misplaced, colour))
+        return ConfirmedGain.of_change_db(self, changed, lost, ideal, misplaced, colour)
 
 
 def _opened(work: Path, workload: Workload) -> TrueCapture:
@@ -158,8 +163,8 @@ def _promises(
         for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=recorder)):
             if restored.degradation is None or restored.degradation.deblur is None:
                 continue
-            changed, lost, ideal, misplaced = recorder.asked[-1]
-            gone = confirmation.removed(changed, lost)
+            changed, lost, ideal, misplaced, colour = recorder.asked[-1]
+            gone = confirmation.removed(changed, lost + colour[0])
             before_db, valid_px = straight_db[restored.frame.index]
             yield {
                 "capture": workload.name,
@@ -167,7 +172,7 @@ def _promises(
                 "frame": restored.frame.index,
                 "removed": gone,
                 "misplaced": np.stack((*misplaced.errors(gone), misplaced.weight)).tolist(),
-                "logarithms": confirmation.gain_regressors(ideal, recorder.left).tolist(),
+                "regressors": confirmation.gain_regressors(ideal, recorder.left, colour[1]).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
             }
 
@@ -189,7 +194,7 @@ def _swept_gains(truth: TrueCapture, plan: RestorationPlan, swept: Swept, straig
 
 
 def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
-    left = np.exp([row["logarithms"] for row in rows] @ coefficients)
+    left = confirmation.remaining_error(np.array([row["regressors"] for row in rows]), coefficients)
     gone = np.array([row["removed"] for row in rows])
     blurred, restored, weight = np.array([row["misplaced"] for row in rows]).transpose(1, 0, 2)
     before, after = confirmation.errors(left[:, None], gone[:, None], blurred, restored)
@@ -197,7 +202,7 @@ def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
 
 
 def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:
-    """Coefficients (3,) by robust least squares."""
+    """Coefficients (4,) by robust least squares; none below 0 but the constant."""
     gain_db = np.array([row["gain_db"] for row in rows])
     weight = 1 / np.sqrt([np.count_nonzero(captures == name) for name in captures])
     weight /= weight.mean()
@@ -205,7 +210,8 @@ def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:
     def off(coefficients: Array) -> Array:
         return np.asarray((_promised_db(rows, coefficients) - gain_db) * weight)
 
-    return np.asarray(least_squares(off, confirmation.LEFT_OVER, loss="soft_l1", f_scale=OUTLYING_DB).x)
+    bounds = ([-np.inf, 0, 0, 0], np.inf)
+    return np.asarray(least_squares(off, confirmation.LEFT_OVER, bounds=bounds, loss="soft_l1", f_scale=OUTLYING_DB).x)
 
 
 def _peak(values: Sequence[float], gains_db: Array) -> float:

@@ -104,6 +104,8 @@ WORKLOADS = (
     _workload("bright", "bright", ORDINARY_PX, "bright", 16.0, 1.4, 2.0),
     _workload("bright-p", "bright", ORDINARY_PX, "bright", 10.0, 1.2, 2.0),
 )
+COLOURFUL = (_workload("colours", "ordinary", ORDINARY_PX, "colours", 16.0, 1.4, 1.5),)
+"""Saturated colours, where half of the error by blur is in the colour differences."""
 QUICK = ("leaves", "photographs", "long", "bright")
 
 
@@ -185,12 +187,19 @@ SHORT = (
     _phone("short-sharp", "leaves", 8.0, 0.9, 1.5, (0.0, 6.0), sharpen=0.8, offset_s=0.002),
 )
 """Blur of 1 to 5 px, where the achievable gain is small and easily overestimated."""
+ODD = (
+    _phone("colours", "colours", 14.0, 1.0, 2.0, ORDINARY_PX, offset_s=-0.002),
+    _phone("board", "board", 14.0, 1.0, 2.5, ORDINARY_PX, tone=0.6, offset_s=0.002),
+    _phone("steep", "photographs", 14.0, 0.8, 2.0, ORDINARY_PX, tone=0.8, denoise=1.0),
+    _phone("flat", "leaves", 14.0, 1.0, 2.0, ORDINARY_PX, tone=0.1, sharpen=0.0, stabiliser_rest=0.4),
+)
+"""Phones whose scene, tone curve or stabiliser differs from the others': half of all captures are then phones'."""
 HONEST_QUICK = ("leaves", "phone-fast", "phone-stabilised", "defocused-calm")
 
 
 def honesty_workloads(scale: Scale) -> list[Workload]:
     """Captures of the honesty table: landscape, defocused, phone and short blur; with --quick four, six frames each."""
-    every = [*(w for w in WORKLOADS if not w.name.endswith("-p")), *DEFOCUSED, *PHONES, *SHORT]
+    every = [*(w for w in WORKLOADS if not w.name.endswith("-p")), *COLOURFUL, *DEFOCUSED, *PHONES, *SHORT, *ODD]
     return [_shortened(w, 6) for w in every if w.name in HONEST_QUICK] if scale.quick else every
 
 

@@ -57,7 +57,7 @@ def simulate(
         typer.Option(metavar="CAPTURE", help="Re-create this capture: its camera, timestamps, exposures and motion."),
     ] = None,
     scene: Annotated[
-        str, typer.Option(metavar="KIND", help="Scene: leaves, bright, board, text or photographs.")
+        str, typer.Option(metavar="KIND", help="Scene: leaves, colours, bright, board, text or photographs.")
     ] = "leaves",
     width: Annotated[int, typer.Option(metavar="PX", help="Frame width.")] = 720,
     height: Annotated[int, typer.Option(metavar="PX", help="Frame height.")] = 1280,

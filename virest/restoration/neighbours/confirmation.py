@@ -28,12 +28,13 @@ USUAL_SHARE, USUAL_SHARE_STD = 1.0, 0.5
 """Prior of the share: 1 for a correct restoration.  On 8 simulated captures, with exact profiles and with a phone's
 errors, it scattered by 0.3 between captures.  The prior is wider, so that wrong models are detected, while a few pairs
 that contradict each other still do not outweigh it."""
-LEFT_OVER = (3.51, 0.59, 0.26)
-"""Coefficients of ln of the remaining squared error, grey levels squared: a constant, and the slopes over ln of the
-spectra's ideal error and over ln of the part that neighbours do not find restored.
+LEFT_OVER = (3.51, 0.59, 0.26, 0.7)
+"""Coefficients of the remaining squared error, grey levels squared.  Of ln of luma's: a constant, and the slopes over
+ln of the spectra's ideal error and over ln of the part that neighbours do not find restored.  Then that of the colour
+differences' ideal error, which a regression on the restored luma undercuts.
 
-Each of the two predicts the error only to a factor.  ``python -m virest.app.bench --only fits`` fits the coefficients
-to pictures with ground truth: 3.51 ± 0.36, 0.59 ± 0.08, 0.26 ± 0.06 on 18 captures; median error 0.59 dB."""
+Each predicts the error only to a factor.  ``python -m virest.app.bench --only fits`` fits the coefficients to pictures
+with ground truth: 3.51 ± 0.36, 0.59 ± 0.08, 0.26 ± 0.06 on 18 captures; median error 0.59 dB."""
 LEFT_OVER_STD = 0.50
 """Standard deviation of that logarithm, from the same benchmark."""
 IN_PLACE = Misplaced()
@@ -57,25 +58,33 @@ class ConfirmedGain:
         """The expected gain, dB, given the model's predicted gain, before a frame is restored."""
         return _gain_db(min(self.share, 1.0) * (1 - 10 ** (-promised_db / 10)))
 
-    def taken(self, further: float) -> float:
+    @property
+    def taken(self) -> float:
         """The fraction of the change that leaves the least error.
 
-        further: sum of the weights of the neighbours restored with the frame.  Errors of the frames' kernels are
-        independent, so the wrong part of the change falls with their number.
+        It holds for frames restored with neighbours too: what is wrong with a phone's kernels (its tone curve, the
+        gyroscope's low pass) is wrong in all frames.
         """
-        return float(np.clip(1 - 0.5 * (1 - self.share) / (1 + further), 0.0, 1.0))
+        return float(np.clip(0.5 * (1 + self.share), 0.0, 1.0))
 
     def of_change_db(
-        self, changed: float, lost: float, ideal: float, misplaced: Misplaced = IN_PLACE
+        self,
+        changed: float,
+        lost: float,
+        ideal: float,
+        misplaced: Misplaced = IN_PLACE,
+        colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
         """Gain, dB, of a restored picture, and its standard deviation.
 
         changed: mean square difference from the recorded picture; lost: that removed by the blur; ideal: an ideal
-        filter's error, the last two from the spectra, all in grey levels squared.  misplaced: error by displaced rows.
+        filter's error, the last two of luma, from the spectra, all in grey levels squared.  misplaced: error by
+        displaced rows.  colour: errors that an ideal filter removes from the colour differences, and that it leaves.
         The deviation combines the uncertainty of the remaining error (LEFT_OVER_STD), of the removed error (the scatter
         of the share, and the disagreement of ``changed`` and ``lost``), and of the rows' displacement.
         """
-        left = float(np.exp(gain_regressors(ideal, self.left) @ np.array(LEFT_OVER)))
+        lost += colour[0]
+        left = float(remaining_error(gain_regressors(ideal, self.left, colour[1]), np.array(LEFT_OVER)))
         gone = removed(changed, lost)
         before, after = errors(left, gone, *misplaced.errors(gone))
         gains_db = 10 * np.log10(before / after)
@@ -101,9 +110,14 @@ def removed(changed: float, lost: float) -> float:
     return float(np.sqrt(changed * max(lost, 0.0)))
 
 
-def gain_regressors(ideal: float, left: float) -> Array:
-    """(3,) the regressors of :data:`LEFT_OVER`."""
-    return np.asarray(np.log(np.maximum((np.e, ideal, left), 1e-6)))
+def gain_regressors(ideal: float, left: float, colour: float) -> Array:
+    """(4,) the regressors of :data:`LEFT_OVER`."""
+    return np.array([*np.log(np.maximum((np.e, ideal, left), 1e-6)), colour])
+
+
+def remaining_error(regressors: Array, coefficients: Array) -> Array:
+    """Squared error (...) that a restoration leaves, from regressors (..., 4) and :data:`LEFT_OVER`."""
+    return np.asarray(np.exp(regressors[..., :3] @ coefficients[:3]) + coefficients[3] * regressors[..., 3])
 
 
 def _gain_db(part: float) -> float:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.blur import Image
+from virest.image_formation.kernel_spread import KernelSpread
 from virest.image_formation.kernels import KernelField
 from virest.image_formation.neighbour import NeighbourView
 from virest.restoration.neighbours.reduced_tiles import TILE
@@ -58,8 +59,26 @@ BESIDE = 1.1
 """Tiles whose distance, over their side, is at most this are side by side; diagonal ones are 1.3 to 1.4 apart."""
 CUBIC = -0.75
 """Slope at one pixel of the kernel of OpenCV's cubic interpolation."""
+LONGEST_ROW = 2**14
+"""Points that OpenCV interpolates at once: its pictures are less than 2¹⁵ pixels long."""
 HALF = 2
 """Neighbours' colour is registered at this many times lower resolution: a movie stores no more of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShiftField:
+    """Shift, px, of what a neighbour shows, over the frame's picture: affine, plus a smooth rest."""
+
+    affine: Array
+    """(3, 2) coefficients of 1, x, y."""
+    centres_px: Array
+    """(n, 2) centres of a grid of tiles."""
+    rest_px: Array
+    """(n, 2) rest at the centres."""
+
+    def at(self, points_px: Array) -> Array:
+        """The shift at points (..., 2)."""
+        return _at(self.affine, points_px) + _between_tiles(self.rest_px, self.centres_px, points_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +89,8 @@ class NeighbourRegistration:
     """Movie index."""
     view: NeighbourView
     """The predicted registration."""
-    affine: Array
-    """(3, 2) coefficients of 1, x, y: shift, px, of what the neighbour shows at a predicted position."""
+    shift: ShiftField
+    """How far what the neighbour shows lies from its predicted position."""
     gain: float
     """The neighbour's light over the frame's."""
     field: Callable[[Array], KernelField]
@@ -88,6 +107,8 @@ class NeighbourRegistration:
     """(n,) standard deviation of the registration in those tiles, per axis."""
     coding_noise_ratio: float = 1.0
     """The frame's coding noise over the neighbour's: above 1 if the neighbour was coded with a finer step."""
+    spread: KernelSpread | None = None
+    """Uncertainty of its kernels; None: exact."""
 
     @property
     def longest_px(self) -> float:
@@ -110,11 +131,7 @@ class NeighbourRegistration:
 
     def std_at_px(self, centres_px: Array) -> Array:
         """(m,) registration deviation at points (m, 2), interpolated between the nearest four tiles."""
-        x, y = (np.unique(along) for along in self.centres_px.T)
-        power = np.square(self.std_px).reshape(len(y), len(x)).astype(np.float32)
-        at = [np.interp(c, k, np.arange(len(k))).astype(np.float32) for c, k in zip(centres_px.T, (x, y), strict=True)]
-        found = cv2.remap(power, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.sqrt(found.ravel().astype(float))
+        return np.sqrt(_between_tiles(np.square(self.std_px), self.centres_px, centres_px))
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,30 +151,26 @@ def register_neighbour(
     number: int,
     agreement: TileAgreement,
     independent_error: float,
+    spread: KernelSpread | None = None,
 ) -> NeighbourRegistration | None:
     """Register a neighbour to the frame; None with fewer than 2 LEAST_SHIFTS usable tiles.
 
     field: the neighbour's kernels, from the view.  independent_error: expected mean square difference by independent
     noise.
 
-    The shifts that remain after the predicted motion are modelled as affine over the picture.
+    spread: uncertainty of the kernels; None: exact.
     """
     used = agreement.precision > 0
     if np.count_nonzero(used) < 2 * LEAST_SHIFTS:
         return None
-    affine, typical_px = _affine(agreement.centres_px[used], agreement.shift_px[used], agreement.precision[used])
-    off_px = agreement.shift_px[used] - _at(affine, agreement.centres_px[used])
-    common_px = _common_shift_px(agreement.centres_px[used], off_px, typical_px, TILE * agreement.times)
-    noise_px = np.sqrt(max(typical_px**2 - common_px**2, 0.0))
-    std_px = np.full(len(used), common_px)
-    std_px[used] = _registration_std_px(off_px, common_px, noise_px)
-    std_px = np.hypot(std_px, noise_px * np.sqrt(LEAST_SHIFTS / len(off_px)))
-    trust, alike = _trust(agreement, _at(affine, agreement.centres_px), noise_px, independent_error)
+    shift, noise_px, std_px = _shift_field(agreement, used)
+    trust, alike = _trust(agreement, shift.at(agreement.centres_px), noise_px, independent_error)
     height, width = trust.shape
     seen = (agreement.inside & ~agreement.clipped)[:height, :width]
     return NeighbourRegistration(
-        number, view, affine, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px
-    )
+        number, view, shift, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px,
+        spread=spread,
+    )  # fmt: skip
 
 
 def resample_neighbour(
@@ -167,7 +180,7 @@ def resample_neighbour(
 
     detailed: see :func:`is_detailed`; the luma is then interpolated from 8 × 8 pixels, at four times the cost.
     """
-    source = registration.view.map_px(lambda points_px: points_px - _at(registration.affine, points_px))
+    source = registration.view.map_px(lambda points_px: points_px - registration.shift.at(points_px))
     reading = cv2.INTER_LANCZOS4 if detailed else cv2.INTER_CUBIC
     registered = cv2.remap(light, source, None, reading, borderMode=cv2.BORDER_REPLICATE)
     registered_half = cv2.remap(half_light, _halved(source), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -321,6 +334,29 @@ def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array
     return found, typical
 
 
+def _shift_field(agreement: TileAgreement, used: NDArray[np.bool_]) -> tuple[ShiftField, float, Array]:
+    """The shifts over the picture, the tiles' noise per axis, px, and the field's deviation (n,) per axis, px.
+
+    Affine, plus what adjacent tiles share: a rest of the stabiliser, rolling-shutter wobble, relief.  That part is
+    taken for a random field with the correlation exp(−½ (d / side)²) over the distance d, in which tiles' noise is
+    independent, and is estimated with the least expected error (kriging; Cressie 1993,
+    doi:10.1002/9781119115151).
+    """
+    centres_px, side_px = agreement.centres_px, float(TILE * agreement.times)
+    affine, typical_px = _affine(centres_px[used], agreement.shift_px[used], agreement.precision[used])
+    off_px = agreement.shift_px[used] - _at(affine, centres_px[used])
+    length_px = np.linalg.norm(off_px, axis=1)
+    common_px = _common_shift_px(centres_px[used], off_px, typical_px, side_px)
+    noise_px = float(np.sqrt(max(typical_px**2 - common_px**2, 0.0)))
+    apart = np.linalg.norm(centres_px[:, None] - centres_px, axis=-1) / side_px
+    together = common_px**2 * np.exp(-0.5 * apart**2)
+    noise_px2 = noise_px**2 * np.maximum(1.0, length_px / (HUBER * typical_px)) ** 2 + 1e-6
+    gain = np.linalg.solve(together[np.ix_(used, used)] + np.diag(noise_px2), together[used]).T
+    left_px2 = np.maximum(common_px**2 - np.einsum("ij,ji->i", gain, together[used]), 0.0)
+    of_affine_px2 = noise_px**2 * LEAST_SHIFTS / len(off_px)
+    return ShiftField(affine, centres_px, gain @ off_px), noise_px, np.sqrt(left_px2 + of_affine_px2)
+
+
 def _common_shift_px(centres_px: Array, off_px: Array, typical_px: float, spacing_px: float) -> float:
     """Deviation, per axis, of the part of shifts (n, 2) common to adjacent tiles: the affine field's error, not noise.
 
@@ -334,14 +370,15 @@ def _common_shift_px(centres_px: Array, off_px: Array, typical_px: float, spacin
     return float(np.sqrt(max(products.mean() / 2, 0.0))) if len(products) else typical_px
 
 
-def _registration_std_px(off_px: Array, common_px: float, noise_px: float) -> Array:
-    """(n,) RMS registration error, per axis, in tiles whose shifts differ from the field by off_px (n, 2).
-
-    With normal priors, the expected error is share · off_px, share = lasting² / (lasting² + noise²), with the variance
-    share · noise².
-    """
-    share = common_px**2 / max(common_px**2 + noise_px**2, 1e-12)
-    return np.asarray(np.sqrt(share**2 * (off_px**2).sum(axis=1) / 2 + share * noise_px**2))
+def _between_tiles(values: Array, tiles_px: Array, points_px: Array) -> Array:
+    """Values (n,) or (n, 2) at the centres of a grid of tiles, interpolated linearly at points (..., 2)."""
+    x, y = (np.unique(along) for along in tiles_px.T)
+    grid = values.reshape(len(y), len(x), -1).astype(np.float32)
+    flat = points_px.reshape(-1, 2)
+    at = [np.interp(c, k, np.arange(len(k))).astype(np.float32) for c, k in zip(flat.T, (x, y), strict=True)]
+    rows = np.array_split(np.arange(len(flat)), len(flat) // LONGEST_ROW + 1)
+    found = [cv2.remap(grid, at[0][r], at[1][r], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for r in rows]
+    return np.concatenate(found).reshape(points_px.shape[:-1] + values.shape[1:]).astype(float)
 
 
 def _at(affine: Array, points_px: Array) -> Array:

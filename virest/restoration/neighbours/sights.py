@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.image_formation.blur import Image
+from virest.image_formation.kernel_spread import kernel_spread
 from virest.image_formation.kernels import KernelField, kernel_field
 from virest.image_formation.neighbour import neighbour_view
 from virest.image_formation.row_motion import RowMotion
@@ -181,7 +182,11 @@ class FrameNeighbours:
         level = 255 * float(curve.encode(np.array(agreement.light)))
         slope = float(np.interp(level, np.arange(256), curve.slope_table()))
         error = agreement.expected_error(luma.frequency, luma.noise, slope)
-        registration = register_neighbour(view, along, other.frame.index, agreement, error)
+        spread = None
+        if refined is not None:  # the rate is as uncertain in the neighbour as in the frame
+            profile, of_path = here.motion.profile, replace(refined, motion=other.motion).path_covariance_px2()
+            spread = kernel_spread(along, profile.width, profile.height, of_path)
+        registration = register_neighbour(view, along, other.frame.index, agreement, error, spread)
         return (
             None if registration is None else replace(registration, coding_noise_ratio=_coding_noise_ratio(other, here))
         )

@@ -81,7 +81,7 @@ def measure_picture(
     luma_step = coding_step if bounds_luma else None
     spectra, colour = [(light, cells, white_levels, luma_step), (grey, cells, white_levels, luma_step)], grey
     if red_blue:
-        colourful = _most_colourful(parts)
+        colourful, part_of_picture = _most_colourful(parts)
         colour_step = None if coding_step is None else STORED_COLOUR_PX * coding_step
         colour = (observed(1, colourful) + observed(2, colourful)) * np.float32(0.5)
         spectra.append((colour, RingCells(passed[colourful]), white_noise(red_blue[0]), colour_step))
@@ -100,7 +100,9 @@ def measure_picture(
     planes = [plane.astype(np.float32) for i in colourful for plane in parts[i][1:]]
     variance = float(np.mean([variance_within(plane, round(of_chroma[0].period_px)).mean() for plane in planes]))
     samples = len(colourful) * (SIDE / STORED_COLOUR_PX) ** 2
-    of_chroma = [of_chroma[0].with_signal_variance(variance, samples, of_luma)]
+    of_chroma = [
+        replace(of_chroma[0].with_signal_variance(variance, samples, of_luma), part_of_picture=part_of_picture)
+    ]
     if weight:
         of_chroma = [replace(of_chroma[0], places=place_statistics(of_chroma[0], colour, passed[colourful], weight))]
     return of_luma, of_chroma[0]
@@ -111,13 +113,15 @@ def _planes(picture: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
     return (picture,) if picture.ndim == 2 else tuple(cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb)))
 
 
-def _most_colourful(parts: Sequence[tuple[NDArray[np.uint8], ...]]) -> NDArray[np.intp]:
-    """Indices, ascending, of the half of the tiles whose colours vary most.
+def _most_colourful(parts: Sequence[tuple[NDArray[np.uint8], ...]]) -> tuple[NDArray[np.intp], float]:
+    """Indices, ascending, of the half of the tiles whose colours vary most, and all tiles' mean variance over theirs.
 
     The others hold little colour, and a filter that is optimal for them would remove the colour of these.
     """
-    spread = [sum(float(cv2.meanStdDev(plane)[1][0, 0]) ** 2 for plane in part[1:]) for part in parts]
-    return np.sort(np.argsort(spread)[len(parts) // 2 :])
+    variances = np.array([sum(float(cv2.meanStdDev(plane)[1][0, 0]) ** 2 for plane in part[1:]) for part in parts])
+    chosen = np.sort(np.argsort(variances)[len(parts) // 2 :])
+    of_chosen = float(variances[chosen].mean())
+    return chosen, float(variances.mean()) / of_chosen if of_chosen else 1.0
 
 
 def _minus_impulse(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
