@@ -42,7 +42,8 @@ of 256 px in 32 sharp frames of photographs, print and drawings."""
 FIELD_SAMPLES, LIGHT_STEPS = (6, 5), 2
 """Rows and columns of the grid on which paths are computed to correct light, and number of corrections.
 
-The first gains 0.1 to 0.35 dB, the second up to 0.1, two more up to 0.05 or lose as much (three captures)."""
+The first gains 0.1 to 0.35 dB, the second up to 0.1, two more up to 0.05 or lose as much (three captures).  With few
+iterations one is made."""
 LEAST_LIGHT = 1e-6
 """Keeps divisors above 0; the darkest grey level is 3e-4."""
 NEARBY_SIDE, FINE_SIDE = 5, 3
@@ -66,7 +67,9 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
         [cv2.add(luma, difference) for difference in _three_differences(*differences)]
         for luma, differences in (recorded, (small, red_blue))
     )
-    small_grey, *differences = _grey_differences(blurred, small, _consistent_light(blurred, small, seen, light, scale))
+    steps = 1 if settings.iterations <= FEW_ITERATIONS else LIGHT_STEPS
+    channels = _consistent_light(blurred, small, seen, light, scale, steps)
+    small_grey, *differences = _grey_differences(blurred, small, channels)
     slopes = _regression_slopes(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
     rests = [cv2.subtract(d, cv2.multiply(s, small_grey)) for d, s in zip(differences, slopes, strict=True)]
 
@@ -205,7 +208,7 @@ def _grey_differences(blurred: BlurredPicture, luma: Image, channels: Sequence[I
 
 
 def _consistent_light(
-    blurred: BlurredPicture, luma: Image, recorded: list[Image], restored: list[Image], scale: int
+    blurred: BlurredPicture, luma: Image, recorded: list[Image], restored: list[Image], scale: int, steps: int
 ) -> Sequence[Image]:
     """Restored light of the channels, (height, width) each, made non-negative and consistent with what was recorded.
 
@@ -223,7 +226,7 @@ def _consistent_light(
     noise = np.hypot(blurred.statistics.noise_levels, blurred.chroma.colour_noise_levels)
     least = float(blurred.curve.linear_table()[int(np.clip(np.rint(noise), 1, 255))])
     measured = _measured(blurred, scale)
-    for _ in range(LIGHT_STEPS):
+    for _ in range(steps):
         ratio = cv2.divide(seen + least, blur(light) + least)
         if measured is not None:
             ratio = 1 + measured * (ratio - 1)
