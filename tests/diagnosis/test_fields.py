@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges
+from virest.diagnosis.field.bridging import Bridges, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import with_fields
@@ -70,11 +70,13 @@ def judged(
     """Fields after a ladder of some rungs, as a diagnosis requests them; fitted: terms in from the start."""
     capture, observed = phone.capture, phone.observed
     doubtful = doubtful_pairs(observed, capture, nominal)
-    rest = observed.chosen(~doubtful.hit) if doubtful.sets_aside else observed
-    evidence = make_evidence(capture.imu, rest)
-    found = with_fields(climb(evidence, nominal, fitted, (), max_rungs=rungs), evidence, capture)
-    if doubtful.sets_aside:
-        with_bridges(found, observed, doubtful, capture)
+    evidence = make_evidence(capture.imu, doubtful.for_ladder(observed))
+    bridges = Bridges.over(doubtful, observed, capture) if doubtful.stretches else None
+    found = climb(evidence, nominal, fitted, (), max_rungs=rungs, bridged=bridges and bridges.refitted)
+    found.evidence = evidence
+    if bridges is not None:
+        with_bridges(found, bridges, capture)
+    found = with_fields(found, found.evidence, capture)
     return found, [finding_of(entry, found.noise_px) for entry in found.fields]
 
 

@@ -115,6 +115,10 @@ class FieldForm:
                 held.insert(place, field.with_values(values + _at_knots(before, field)))
         return profile.with_fields(held)
 
+    def removed_from(self, profile: CameraProfile) -> CameraProfile:
+        """The profile without these fields."""
+        return profile.with_fields([f for f in profile.fields if not any(map(f.is_in_place_of, self.fields))])
+
     @staticmethod
     def held_in(profile: CameraProfile, field: Field) -> Field:
         """The profile's counterpart of a field; the field itself where there is none."""
