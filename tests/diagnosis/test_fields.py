@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.field.bridging import Bridges, doubtful_pairs, with_bridges
+from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import with_fields
@@ -22,12 +22,12 @@ from virest.diagnosis.field.stretches import bridging_form, rate_walk
 from virest.diagnosis.field.sudden import best_instant
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
-from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
+from virest.diagnosis.geometric_evidence import Evidence, Model, base_scene, make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.image_formation.point_model import TrackTable
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
-from virest.inference.profile_terms import FOCAL_DRIFT, K1, PRINCIPAL_POINT
+from virest.inference.profile_terms import FOCAL_DRIFT, GYRO_BIAS, K1, PRINCIPAL_POINT
 from virest.inference.track_fit import Term, TrackFit
 
 HAND = Setup(
@@ -216,6 +216,58 @@ def test_a_gyroscope_that_clips_is_found_at_its_limit() -> None:
     _, (field,) = judged(phone, phone.profile)
     assert "beyond 1.4 rad/s the gyroscope reads too little: it clips" in field.sentence
     assert field.held_out.after < field.held_out.before
+
+
+def test_a_bridged_gap_does_not_turn_gravity_into_a_bias() -> None:
+    """Without its bridge, a gap turns gravity for all later frames, and a gyroscope bias compensates for that."""
+    wall = replace(HAND, seed=86, sway_m=0.03, plane_per_m=(0.05, -0.1, 0.4), accel_bias_m_s2=(0.0, 0.0, 0.0))
+    phone = StrangePhone(wall, Strange(gyro=filled(0.9, 1.06)))
+    nominal = replace(phone.profile, depth_m=None)
+    doubtful = doubtful_pairs(phone.observed, phone.capture, nominal)
+    evidence = make_evidence(phone.imu, doubtful.for_ladder(phone.observed))
+    start = Model(nominal, None, ())
+    table = evidence.table(start, 4000)
+    start = replace(start, scene=base_scene(evidence, nominal, table))
+    bridged = Bridges.over(doubtful, phone.observed, phone.capture).refitted(start)
+    fits = [evidence.fit(model, (GYRO_BIAS,), table) for model in (start, bridged)]
+    away, left = (float(np.linalg.norm(fit.value("gyro_bias") / fit.std("gyro_bias"))) for fit in fits)
+    print("BIAS", away, left, [(f.value("gyro_bias"), f.std("gyro_bias"), f.scale) for f in fits])
+    assert left < 4
+    assert away > 2 * left
+
+
+def test_a_gyroscope_that_clips_in_most_frames_is_bridged_in_all() -> None:
+    """Too few pairs are left for the ladder alone: with bridges it climbs on all of them, and finds nothing else."""
+    phone = StrangePhone(replace(HAND, seed=87), Strange(gyro=lambda t, reading, _: np.clip(reading, -1.0, 1.0)))
+    doubtful = doubtful_pairs(phone.observed, phone.capture, phone.profile)
+    assert (~doubtful.hit).sum() < LEAST_PAIRS_LEFT
+    verdict, (field,) = judged(phone, phone.profile, rungs=1)
+    assert not verdict.accepted
+    assert gained(field) > 0.9
+
+
+@pytest.mark.scenario
+def test_a_wrong_offset_beside_a_gap_keeps_its_name_and_size() -> None:
+    """Bridges follow the causes that enter."""
+    wall = replace(HAND, seed=88, sway_m=0.03, plane_per_m=(0.05, -0.1, 0.4), accel_bias_m_s2=(0.0, 0.0, 0.0))
+    phone = StrangePhone(wall, Strange(gyro=filled(1.1, 1.25)))
+    nominal = replace(phone.profile, depth_m=None, time_offset_s=phone.setup.time_offset_s - 0.006)
+    verdict, (field,) = judged(phone, nominal, rungs=2)
+    assert [entry.name for entry in verdict.accepted] == ["time_offset"]
+    assert verdict.model.profile.time_offset_s == pytest.approx(phone.setup.time_offset_s, abs=1e-4)
+    assert gained(field) > 0.95
+
+
+def test_a_bridge_that_no_row_sees_blurs_nothing() -> None:
+    """The rate between two exposures is uncertain without making a blur path so."""
+    phone = StrangePhone(replace(HAND, seed=89), Strange())
+    _, fitted, table = fitted_to(phone)
+    end_s = float(phone.stamp_s[20]) + phone.setup.time_offset_s
+    start_s = end_s - 0.004
+    for from_s, to_s, is_seen in ((start_s, end_s, False), (start_s, end_s + 0.02, True)):
+        form = bridging_form([Stretch("straight", from_s, to_s, (0, 1, 2))], 0, rate_walk(phone.imu))
+        (blur_px,) = blur_std_px(fitted, table, form, np.eye(form.basis.shape[1]))
+        assert (blur_px > 0) == is_seen
 
 
 def test_what_no_row_sees_of_a_stretch_is_straight_and_in_doubt() -> None:

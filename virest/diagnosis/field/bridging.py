@@ -132,7 +132,7 @@ def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) ->
     covariance = found.fit.covariance[part_of, part_of]
     std = form.filled(np.zeros(len(covariance)), covariance)
     fields = (replace(form.held_in(profile, own), std=own.std) for own in std)
-    accurate = _blur_std_px(found.fit, found.table, form, covariance) < MAX_BLUR_STD_PX
+    accurate = blur_std_px(found.fit, found.table, form, covariance) < MAX_BLUR_STD_PX
     untrusted = tuple((s.from_s, s.to_s) for s in stretches)
     profile = replace(profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
     found.model = replace(found.model, profile=profile)
@@ -166,7 +166,7 @@ def _refit(found: GeometricVerdict, evidence: Evidence, start: Model, terms: Seq
     found.noise_px = evidence.noise_px(fitted)
 
 
-def _blur_std_px(fitted: TrackFit, table: TrackTable, form: FieldForm, covariance: Array) -> Array:
+def blur_std_px(fitted: TrackFit, table: TrackTable, form: FieldForm, covariance: Array) -> Array:
     """Largest standard deviation (bridges,) of the blur-path length of a point seen in a bridge, px.
 
     Rates between two frames' exposures are uncertain but blur nothing.
