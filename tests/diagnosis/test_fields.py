@@ -12,7 +12,7 @@ from motion.synthetic_tracks import Setup
 from numpy.typing import NDArray
 
 from virest.calibration.geometry import calibrate_geometry
-from virest.camera.field import Field
+from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
@@ -231,7 +231,6 @@ def test_a_bridged_gap_does_not_turn_gravity_into_a_bias() -> None:
     bridged = Bridges.over(doubtful, phone.observed, phone.capture).refitted(start)
     fits = [evidence.fit(model, (GYRO_BIAS,), table) for model in (start, bridged)]
     away, left = (float(np.linalg.norm(fit.value("gyro_bias") / fit.std("gyro_bias"))) for fit in fits)
-    print("BIAS", away, left, [(f.value("gyro_bias"), f.std("gyro_bias"), f.scale) for f in fits])
     assert left < 4
     assert away > 2 * left
 
@@ -258,6 +257,27 @@ def test_a_wrong_offset_beside_a_gap_keeps_its_name_and_size() -> None:
     assert gained(field) > 0.95
 
 
+def test_the_knots_of_a_bridge_follow_what_a_clipped_peak_lacks() -> None:
+    """The angle of the missing rate comes back to 0.15 mrad in the typical peak."""
+    phone = StrangePhone(replace(HAND, seed=91, frames=240), Strange())
+    time_s, whole = phone.imu.time_s, phone.imu.gyro_rad_s
+    limit = 1.3
+    clipped = replace(phone.imu, gyro_rad_s=np.clip(whole, -limit, limit))
+    worst_rad = []
+    for stretch in doubtful_stretches(clipped):
+        form = bridging_form([stretch], 0, np.ones(3))
+        (axis,), knots = stretch.axes, form.fields[0].knots[0]
+        inside = (time_s >= stretch.from_s) & (time_s <= stretch.to_s)
+        if inside.sum() < 6:
+            continue
+        lacking = (whole - clipped.gyro_rad_s)[inside, axis]
+        basis = cardinal_weights(knots, time_s[inside])[:, 1:-1]
+        left = lacking - basis @ np.linalg.lstsq(basis, lacking)[0]
+        worst_rad.append(float(np.ptp(np.cumsum(left)) * np.median(np.diff(time_s))))
+    assert len(worst_rad) > 10
+    assert np.median(worst_rad) < 1.5e-4
+
+
 def test_a_bridge_that_no_row_sees_blurs_nothing() -> None:
     """The rate between two exposures is uncertain without making a blur path so."""
     phone = StrangePhone(replace(HAND, seed=89), Strange())
@@ -282,7 +302,7 @@ def test_what_no_row_sees_of_a_stretch_is_straight_and_in_doubt() -> None:
     assert not np.any(std[[0, -1]])
     assert not np.any(std[:, 1])
     middle = np.array(bridge.knots[0]) - 0.5
-    np.testing.assert_allclose(std[:, 0], walk[0] * np.sqrt(middle * (0.2 - middle) / 0.2), atol=1e-6)
+    np.testing.assert_allclose(std[:, 0], walk[0] * np.sqrt(middle * (0.2 - middle) / 0.2), atol=1e-5)
 
 
 def test_two_unknown_effects_at_once_are_two_fields() -> None:
