@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.records import Distrusted
@@ -70,8 +72,8 @@ def judged(
     """Fields after a ladder of some rungs, as a diagnosis requests them; fitted: terms in from the start."""
     capture, observed = phone.capture, phone.observed
     doubtful = doubtful_pairs(observed, capture, nominal)
-    evidence = make_evidence(capture.imu, doubtful.for_ladder(observed))
-    bridges = Bridges.over(doubtful, observed, capture) if doubtful.stretches else None
+    evidence = make_evidence(capture.imu, doubtful.for_ladder(observed), nominal)
+    bridges = Bridges.over(doubtful, observed, capture, nominal) if doubtful.stretches else None
     found = climb(evidence, nominal, fitted, (), max_rungs=rungs, bridged=bridges and bridges.refitted)
     found.evidence = evidence
     if bridges is not None:
@@ -218,17 +220,29 @@ def test_a_gyroscope_that_clips_is_found_at_its_limit() -> None:
     assert field.held_out.after < field.held_out.before
 
 
-def test_a_bridged_gap_does_not_turn_gravity_into_a_bias() -> None:
+class WholeRowsLost(StrangePhone):
+    """The accelerometer's readings are lost and filled too."""
+
+    @cached_property
+    def imu(self) -> ImuSamples:
+        """The log."""
+        log = StrangePhone.imu.func(self)  # type: ignore[attr-defined]
+        return replace(log, accel_m_s2=filled(0.9, 1.06)(log.time_s, log.accel_m_s2, None))
+
+
+@pytest.mark.parametrize("phone_of", [StrangePhone, WholeRowsLost])
+def test_a_bridged_gap_does_not_turn_gravity_into_a_bias(phone_of: type[StrangePhone]) -> None:
     """Without its bridge, a gap turns gravity for all later frames, and a gyroscope bias compensates for that."""
     wall = replace(HAND, seed=86, sway_m=0.03, plane_per_m=(0.05, -0.1, 0.4), accel_bias_m_s2=(0.0, 0.0, 0.0))
-    phone = StrangePhone(wall, Strange(gyro=filled(0.9, 1.06)))
+    phone = phone_of(wall, Strange(gyro=filled(0.9, 1.06)))
     nominal = replace(phone.profile, depth_m=None)
     doubtful = doubtful_pairs(phone.observed, phone.capture, nominal)
-    evidence = make_evidence(phone.imu, doubtful.for_ladder(phone.observed))
+    evidence = make_evidence(phone.imu, doubtful.for_ladder(phone.observed), nominal)
     start = Model(nominal, None, ())
     table = evidence.table(start, 4000)
+    assert table.n_windows == (2 if phone_of is WholeRowsLost else 1)
     start = replace(start, scene=base_scene(evidence, nominal, table))
-    bridged = Bridges.over(doubtful, phone.observed, phone.capture).refitted(start)
+    bridged = Bridges.over(doubtful, phone.observed, phone.capture, nominal).refitted(start)
     fits = [evidence.fit(model, (GYRO_BIAS,), table) for model in (start, bridged)]
     away, left = (float(np.linalg.norm(fit.value("gyro_bias") / fit.std("gyro_bias"))) for fit in fits)
     assert left < 4

@@ -106,8 +106,10 @@ class TrackedPoints:
 
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
         doubtful = doubtful_pairs(observed, self.capture, self.start)
-        evidence = make_evidence(self.capture.imu, doubtful.for_ladder(observed))
-        bridges = Bridges.over(doubtful, observed, self.capture) if self.rungs_allowed and doubtful.stretches else None
+        evidence = make_evidence(self.capture.imu, doubtful.for_ladder(observed), self.start)
+        bridges = None
+        if self.rungs_allowed and doubtful.stretches:
+            bridges = Bridges.over(doubtful, observed, self.capture, self.start)
         found = climb(
             evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed, self.each,
             None if bridges is None else bridges.refitted,

@@ -74,10 +74,10 @@ class Bridges:
     form: FieldForm
 
     @staticmethod
-    def over(doubtful: Doubtful, observed: ObservedTracks, capture: Capture) -> Bridges:
-        """The bridges over some intervals."""
+    def over(doubtful: Doubtful, observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> Bridges:
+        """The bridges over some intervals; profile: its clocks are those of the intervals' pairs."""
         form = bridging_form(doubtful.stretches, capture.stamp_0_ns, rate_walk(capture.imu))
-        return Bridges(make_evidence(capture.imu, observed), doubtful, form)
+        return Bridges(make_evidence(capture.imu, observed, profile), doubtful, form)
 
     def without(self, model: Model) -> Model:
         """The model without bridges."""
@@ -107,7 +107,7 @@ def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) ->
             f"{len(stretches)} stretches of the inertial log look {stretches[0].kind}; "
             "tracked points do not confirm it, and their frames were excluded from the fits"
         )
-        rest = make_evidence(evidence.imu, bridges.doubtful.for_ladder(evidence.observed))
+        rest = make_evidence(evidence.imu, bridges.doubtful.for_ladder(evidence.observed), bare.profile)
         _refit(found, rest, bridges.without(found.model), terms)
         return
     half, after = np.arange(len(table)) % 2 == 0, np.zeros(len(table))
@@ -126,7 +126,7 @@ def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) ->
     holds = np.array([_holds(*rms_px(pairs)) for pairs in near])
     trusted = ~near[~holds].any(axis=0)
     kept = evidence.observed.chosen(trusted) if trusted.sum() >= LEAST_PAIRS_LEFT else evidence.observed
-    _refit(found, make_evidence(evidence.imu, kept), bare, (*terms, bridges.form.term))
+    _refit(found, make_evidence(evidence.imu, kept, bare.profile), bare, (*terms, bridges.form.term))
     profile, form = found.model.profile, bridges.form
     part_of = found.fit.slices[form.name]
     covariance = found.fit.covariance[part_of, part_of]
