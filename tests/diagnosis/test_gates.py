@@ -124,18 +124,23 @@ def test_the_noise_of_brightness_is_that_measured_beforehand(rng: np.random.Gene
 
 
 def test_blur_is_judged_on_blocks_that_it_was_not_fitted_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The masks of fit and judge share no residual, and leave none out."""
+    """The masks of fit and judge share no residual; each effect is judged on the others that determine it."""
     time_s = np.linspace(0.0, 4.0, 80)
     fits: list[Any] = []
     judged: list[Any] = []
     monkeypatch.setattr(local_blur_fit, "fit", lambda *a: fits.append(a[4]))
     monkeypatch.setattr(local_blur_fit, "judge", lambda *a: judged.append(a[3]) or 0.0)
-    local_blur_fit.held_out(SimpleNamespace(time_s=time_s), CameraProfile(64, 48), None, ())  # type: ignore[arg-type]
-    assert len(fits) == len(judged) == 4
+    seen = SimpleNamespace(time_s=time_s, is_edge=np.arange(80) % 3 == 0)
+    effects = (local_blur_fit.ExposureTime(), local_blur_fit.Defocus())
+    gains = local_blur_fit.held_out(seen, CameraProfile(64, 48), None, effects)  # type: ignore[arg-type]
+    assert len(gains) == 2
+    assert len(fits) == 4
+    assert len(judged) == 8
     assert np.array_equal(fits[0], ~fits[-1])
-    for used, held in zip(fits, judged, strict=True):
-        assert not np.any(used & held)
-        assert np.all(used | held)
+    for fold in range(2):
+        of_exposure, _, of_defocus, _ = judged[4 * fold : 4 * fold + 4]
+        assert np.array_equal(of_exposure, ~fits[2 * fold] & ~seen.is_edge)
+        assert np.array_equal(of_defocus, ~fits[2 * fold] & seen.is_edge)
 
 
 # ── gates of the points ──────────────────────────────────────────────────────────────────────────────────────────

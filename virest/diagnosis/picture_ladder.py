@@ -418,8 +418,8 @@ def climb_blur(
             "not reported as a cause"
         )
     if named:
-        held = local_blur_fit.held_out(observations, profile, trajectory, tuple(effects[k] for k in named))
-        for k in named:
+        gains = local_blur_fit.held_out(observations, profile, trajectory, tuple(effects[k] for k in named))
+        for k, held in zip(named, gains, strict=True):
             name, change = effects[k].name, found[k].parameter
             changes = {effects[k].parameters[0]: change}
             p_value = _blur_p_value(name, found[k].deviations)
