@@ -230,17 +230,18 @@ def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_brightness_gains_too(
     held: HeldOutGain, p_value: float, named: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cause of brightness takes 15 % of the excess away and 2 % of the whole, and is significant."""
+    """A cause takes 15 % of the excess away and 2 % of the whole, and is significant; its rung has held-out values."""
     observed = made_observations(hidden(), rng)
     plain, better = (
-        SimpleNamespace(cost=10.0, memory=0.0, profile=NOMINAL),
+        SimpleNamespace(cost=10.0, memory=0.0, rms=3.0, profile=NOMINAL),
         SimpleNamespace(cost=1.0, memory=0.0, rms=1.0, of=lambda _name: (np.zeros(1), np.zeros((1, 1)))),
     )
     monkeypatch.setattr(picture_ladder, "fit_photometry", lambda *_: better)
     monkeypatch.setattr(picture_ladder, "judge", lambda *_, **__: held)
     monkeypatch.setattr(picture_ladder, "significance", lambda *_: (9.0, p_value))
     rung, effect, _ = picture_ladder._rung(observed, NOMINAL, plain, [Vignetting()], [], one_by_one)  # type: ignore[arg-type]
-    assert isinstance(rung, Rung)
+    shown = ({"vignetting": held.after}, held.before) if p_value < 1e-6 else ({}, plain.rms)
+    assert rung == Rung("vignetting" if named else None, *shown, PHOTOMETRY)
     assert (effect is not None) is named
 
 
@@ -258,9 +259,9 @@ def test_a_gain_of_each_frame_takes_half_of_the_excess_on_other_sides(
 
     monkeypatch.setattr(picture_ladder, "judge", judge)
     gain = GainDrift((0, 1), 2)
-    assert picture_ladder._holds(observed, NOMINAL, [Flicker()], gain, one_by_one) is named
+    assert picture_ladder._judged(observed, NOMINAL, [Flicker()], gain, one_by_one) == (held, named)
     assert beside == [[Flicker()]]
-    assert picture_ladder._holds(observed, NOMINAL, [], Vignetting(), one_by_one)
+    assert picture_ladder._judged(observed, NOMINAL, [], Vignetting(), one_by_one) == (held, True)
     assert len(beside) == 3
 
 
