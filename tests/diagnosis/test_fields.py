@@ -207,6 +207,8 @@ def test_a_filled_gap_is_bridged_from_the_points() -> None:
     assert gained(field) > 0.95
     assert "inertial rows there lie on a straight line" in field.sentence
     assert verdict.final_rms_px < 1.3 * HAND.noise_px
+    # under the profile with its bridge, the interval is no longer doubtful
+    assert not doubtful_pairs(phone.observed, phone.capture, verdict.model.profile).stretches
 
 
 def test_a_gyroscope_that_clips_is_found_at_its_limit() -> None:
@@ -270,6 +272,18 @@ def test_a_wrong_offset_beside_a_gap_keeps_its_name_and_size() -> None:
     assert [entry.name for entry in verdict.accepted] == ["time_offset"]
     assert verdict.model.profile.time_offset_s == pytest.approx(phone.setup.time_offset_s, abs=1e-4)
     assert gained(field) > 0.95
+
+
+def test_an_inaccurate_bridge_is_withheld_from_the_profile() -> None:
+    """It joins both sides of its interval in the fit, but restoration must not use it."""
+    stretches = tuple(Stretch("straight", t, t + 0.1, (0, 1, 2)) for t in (0.5, 1.5))
+    good, bad = bridging_form(stretches, 0, np.ones(3)).fields
+    entry = Distrusted(stretches, (good, bad), (True, False), 1e-9, 3.0, 0.2, 0.1)
+    assert entry.withheld == (bad,)
+    field = finding_of(entry, 0.05)
+    assert field.fields == (good,)
+    assert field.held_out.noise == 0.1
+    assert "1 of 2 bridged from the points, the others not corrected by process" in field.sentence
 
 
 def test_the_knots_of_a_bridge_follow_what_a_clipped_peak_lacks() -> None:
