@@ -84,9 +84,9 @@ class Bridges:
         return replace(model, profile=self.form.removed_from(model.profile))
 
     def fitted(self, model: Model, table: TrackTable) -> TrackFit:
-        """Fit bridges, from 0, beside a model's terms and scene."""
+        """Fit bridges, from 0, beside a model's terms and scene; without covariances."""
         bare = self.without(model)
-        return fit_model(self.evidence.imu, bare, (*bare.terms, self.form.term), table)
+        return fit_model(self.evidence.imu, bare, (*bare.terms, self.form.term), table, covariances=False)
 
     def refitted(self, model: Model) -> Model:
         """The model with bridges fitted to all pairs beside its terms and scene."""

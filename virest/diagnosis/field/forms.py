@@ -107,6 +107,8 @@ class FieldForm:
         """The profile with these numbers added to its fields."""
         held = list(profile.fields)
         for field, values in zip(self.fields, self.values(numbers), strict=True):
+            if not values.any():
+                continue
             place = next((k for k, known in enumerate(held) if _adds_to(field, known)), None)
             if place is None:
                 held.append(field.with_values(values))
