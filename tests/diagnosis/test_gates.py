@@ -124,18 +124,23 @@ def test_the_noise_of_brightness_is_that_measured_beforehand(rng: np.random.Gene
 
 
 def test_blur_is_judged_on_blocks_that_it_was_not_fitted_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The masks of fit and judge share no residual, and leave none out."""
+    """The masks of fit and judge share no residual; each effect is judged on the others that determine it."""
     time_s = np.linspace(0.0, 4.0, 80)
     fits: list[Any] = []
     judged: list[Any] = []
     monkeypatch.setattr(local_blur_fit, "fit", lambda *a: fits.append(a[4]))
     monkeypatch.setattr(local_blur_fit, "judge", lambda *a: judged.append(a[3]) or 0.0)
-    local_blur_fit.held_out(SimpleNamespace(time_s=time_s), CameraProfile(64, 48), None, ())  # type: ignore[arg-type]
-    assert len(fits) == len(judged) == 4
+    seen = SimpleNamespace(time_s=time_s, is_edge=np.arange(80) % 3 == 0)
+    effects = (local_blur_fit.ExposureTime(), local_blur_fit.Defocus())
+    gains = local_blur_fit.held_out(seen, CameraProfile(64, 48), None, effects)  # type: ignore[arg-type]
+    assert len(gains) == 2
+    assert len(fits) == 4
+    assert len(judged) == 8
     assert np.array_equal(fits[0], ~fits[-1])
-    for used, held in zip(fits, judged, strict=True):
-        assert not np.any(used & held)
-        assert np.all(used | held)
+    for fold in range(2):
+        of_exposure, _, of_defocus, _ = judged[4 * fold : 4 * fold + 4]
+        assert np.array_equal(of_exposure, ~fits[2 * fold] & ~seen.is_edge)
+        assert np.array_equal(of_defocus, ~fits[2 * fold] & seen.is_edge)
 
 
 # ── gates of the points ──────────────────────────────────────────────────────────────────────────────────────────
@@ -225,17 +230,18 @@ def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_brightness_gains_too(
     held: HeldOutGain, p_value: float, named: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cause of brightness takes 15 % of the excess away and 2 % of the whole, and is significant."""
+    """A cause takes 15 % of the excess away and 2 % of the whole, and is significant; its rung has held-out values."""
     observed = made_observations(hidden(), rng)
     plain, better = (
-        SimpleNamespace(cost=10.0, memory=0.0, profile=NOMINAL),
+        SimpleNamespace(cost=10.0, memory=0.0, rms=3.0, profile=NOMINAL),
         SimpleNamespace(cost=1.0, memory=0.0, rms=1.0, of=lambda _name: (np.zeros(1), np.zeros((1, 1)))),
     )
     monkeypatch.setattr(picture_ladder, "fit_photometry", lambda *_: better)
     monkeypatch.setattr(picture_ladder, "judge", lambda *_, **__: held)
     monkeypatch.setattr(picture_ladder, "significance", lambda *_: (9.0, p_value))
     rung, effect, _ = picture_ladder._rung(observed, NOMINAL, plain, [Vignetting()], [], one_by_one)  # type: ignore[arg-type]
-    assert isinstance(rung, Rung)
+    shown = ({"vignetting": held.after}, held.before) if p_value < 1e-6 else ({}, plain.rms)
+    assert rung == Rung("vignetting" if named else None, *shown, PHOTOMETRY)
     assert (effect is not None) is named
 
 
@@ -253,9 +259,9 @@ def test_a_gain_of_each_frame_takes_half_of_the_excess_on_other_sides(
 
     monkeypatch.setattr(picture_ladder, "judge", judge)
     gain = GainDrift((0, 1), 2)
-    assert picture_ladder._holds(observed, NOMINAL, [Flicker()], gain, one_by_one) is named
+    assert picture_ladder._judged(observed, NOMINAL, [Flicker()], gain, one_by_one) == (held, named)
     assert beside == [[Flicker()]]
-    assert picture_ladder._holds(observed, NOMINAL, [], Vignetting(), one_by_one)
+    assert picture_ladder._judged(observed, NOMINAL, [], Vignetting(), one_by_one) == (held, True)
     assert len(beside) == 3
 
 

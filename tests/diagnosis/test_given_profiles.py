@@ -102,7 +102,8 @@ def blur_findings(monkeypatch: pytest.MonkeyPatch, given: CameraProfile, scale: 
     monkeypatch.setattr(local_blur, "look_for_blur", lambda *_: observations)
     monkeypatch.setattr(local_blur_fit, "fit", lambda *_: found)
     monkeypatch.setattr(local_blur_fit, "judge", lambda *_: 0.1)
-    monkeypatch.setattr(local_blur_fit, "held_out", lambda *a: judged.append(a) or HeldOutGain("", 2.0, 1.0, None))
+    gain = HeldOutGain("", 2.0, 1.0, None)
+    monkeypatch.setattr(local_blur_fit, "held_out", lambda *a: judged.append(a) or [gain] * len(a[3]))
     verdict, _ = climb_blur(None, given, None, None, None)  # type: ignore[arg-type]
     assert not verdict.notes
     assert len(judged) == bool(verdict.findings)

@@ -225,8 +225,9 @@ def test_exposure_and_defocus_are_found_together(altered: Observed) -> None:
         assert value == pytest.approx(truth, rel=0.12)
     assert found.profile.shutter.exposure_scale == found.values[0][0]
     assert found.profile.extensions.defocus_sigma_px == found.values[1][0]
-    held = held_out(*altered, BOTH)
-    assert held.after < 0.95 * held.before
+    of_exposure, of_defocus = held_out(*altered, BOTH)
+    assert of_exposure.after < 0.95 * of_exposure.before
+    assert of_defocus.after < 0.4 * of_defocus.before
 
 
 def test_a_deviation_holds_what_all_widths_have_in_common(altered: Observed) -> None:

@@ -12,8 +12,10 @@ from virest.calibration.physical_limits import impossible
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable, centre, integrate_motion, seen_s
+from virest.image_formation.row_clock import RowClock
 from virest.inference.comparable_noise import noise_distances
-from virest.inference.hold_out import distances, loss
+from virest.inference.doubtful_log import STRAIGHT, STRAIGHT_PART, doubtful_stretches
+from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
 from virest.inference.time_blocks import varied_blocks
@@ -71,6 +73,8 @@ class Evidence:
     observed: ObservedTracks
     block: NDArray[np.intp]
     """(pairs,) number of the time block."""
+    break_s: Array
+    """Times (breaks,) at which the path from the accelerometer is unknown, camera clock."""
 
     def noise_px(self, fitted: TrackFit) -> float:
         """Tracking noise, px: capped residual rms per coordinate about a free smooth flow, without the camera model."""
@@ -101,7 +105,8 @@ class Evidence:
         observed = self.observed
         if model.lag:
             observed = replace(observed, stamp_s=observed.stamp_s + np.array(model.lag))
-        return observed.table(max_points)
+        table = observed.table(max_points)
+        return _split(table, self.break_s) if len(self.break_s) else table
 
     def fit(self, model: Model, terms: Sequence[Term], table: TrackTable, use: Mask | None = None) -> TrackFit:
         """Fit terms and the scene from a model, on the pairs in ``use`` (pairs,)."""
@@ -124,11 +129,35 @@ def fit_model(
     return fit_tracks(imu, table, model.profile, terms, model.scene, max_iterations=iterations, covariances=covariances)
 
 
-def make_evidence(imu: ImuSamples, observed: ObservedTracks) -> Evidence:
-    """Collect the pairs and number their time blocks."""
+def make_evidence(imu: ImuSamples, observed: ObservedTracks, clocks: CameraProfile | None = None) -> Evidence:
+    """Collect the pairs and number their time blocks; clocks: a profile with the clocks' offset, None: they agree."""
     part = min(len(observed.pairs) / FULL_LENGTH_PAIRS, 1.0)
     lengths = [max(round(part * length), 1) for length in BLOCK_LENGTHS]
-    return Evidence(imu, observed, varied_blocks(np.arange(len(observed.pairs)), lengths))
+    break_s = path_breaks(imu)
+    break_s = break_s if clocks is None else np.asarray(RowClock(clocks).camera_time_s(break_s))
+    return Evidence(imu, observed, varied_blocks(np.arange(len(observed.pairs)), lengths), break_s)
+
+
+def path_breaks(imu: ImuSamples) -> Array:
+    """Middles (breaks,), IMU clock, of the intervals in which gyroscope and accelerometer follow straight lines."""
+    bend = np.abs(np.diff(np.diff(imu.accel_m_s2, axis=0) / np.diff(imu.time_s)[:, None], axis=0))
+    time_s, typical = imu.time_s[1:-1], np.median(bend, axis=0)
+    straight = [s for s in doubtful_stretches(imu) if s.kind == STRAIGHT]
+    inside = [(time_s > s.from_s) & (time_s < s.to_s) for s in straight]
+    middles = [
+        0.5 * (s.from_s + s.to_s)
+        for s, rows in zip(straight, inside, strict=True)
+        if np.all(np.median(bend[rows], axis=0) <= STRAIGHT_PART * typical)
+    ]
+    return np.array(middles)
+
+
+def _split(table: TrackTable, break_s: Array) -> TrackTable:
+    """The table with windows that also end at breaks: each has its own velocity."""
+    middle_s = 0.5 * (table.first_stamp_s + table.second_stamp_s)
+    parts = np.stack([table.window, np.searchsorted(break_s, middle_s)])
+    window = np.unique(parts, axis=1, return_inverse=True)[1]
+    return replace(table, window=window, origin_s=group_means(middle_s, window))
 
 
 def relief_loss(fitted: TrackFit) -> float:

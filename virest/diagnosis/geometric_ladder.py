@@ -75,11 +75,13 @@ def climb(
     progress: Callable[[float], None] | None = None,
     max_rungs: int = MAX_RUNGS,
     each: ParallelMap = one_by_one,
+    bridged: Callable[[Model], Model] | None = None,
 ) -> GeometricVerdict:
     """Climb from a profile.
 
     null_terms: unknown values; they are fitted on every rung and are not causes.  lags: start-up schedules to try.
-    far: changes of clocks and axes at which frame rotations and gyroscope agree.
+    far: changes of clocks and axes at which frame rotations and gyroscope agree.  bridged: estimates the rates in
+    doubtful intervals of the log beside a model's causes; called once before the first rung, and after each rung.
 
     Where a rival could have entered instead, the ladder is climbed once more from there, with only the causes of the
     first climb: a rival that needs any other cause is the less simple explanation.
@@ -89,7 +91,8 @@ def climb(
     start = replace(start, scene=base_scene(evidence, nominal, evidence.table(start, SCREEN_POINTS)))
     model, notes = _with_unknowns(evidence, start)
     nominal_model = model
-    context = SearchContext(evidence, nominal, lags, far or FarStart(), each)
+    context = SearchContext(evidence, nominal, lags, far or FarStart(), each, bridged=bridged)
+    model = context.with_bridges(model)
     report(0.1)
     path, fork = _climbed_to_end(context, _Path(model, (), ()), max_rungs)
     report(0.6)
@@ -123,9 +126,10 @@ class _Path:
     accepted: tuple[Accepted, ...]
     rungs: tuple[Rung, ...]
 
-    def further(self, evidence: Evidence, step: _Step, rung: Rung) -> _Path:
+    def further(self, context: SearchContext, step: _Step, rung: Rung) -> _Path:
         """The path extended by a rung and the causes that enter on it."""
-        model, _ = refitted(evidence, step.model, JUDGE_POINTS)
+        model, _ = refitted(context.evidence, step.model, JUDGE_POINTS)
+        model = context.with_bridges(model)
         log.debug("rung %d: %s", len(self.rungs) + 1, _names(step))
         entered = replace(rung, entered=_names(step))
         return _Path(model, (*self.accepted, *step.accepted), (*self.rungs, entered))
@@ -141,8 +145,8 @@ def _climbed_to_end(context: SearchContext, path: _Path, max_rungs: int) -> tupl
             break
         if rival is not None and fork is None:
             fork = (path, rival, rung)
-        path = path.further(context.evidence, step, rung)
-    return path, None if fork is None else fork[0].further(context.evidence, *fork[1:])
+        path = path.further(context, step, rung)
+    return path, None if fork is None else fork[0].further(context, *fork[1:])
 
 
 def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVerdict) -> GeometricVerdict:
@@ -223,6 +227,12 @@ class SearchContext:
     each: ParallelMap
     among: frozenset[str] | None = None
     """Names of the causes that may enter; None: all."""
+    bridged: Callable[[Model], Model] | None = None
+    """Estimates the rates in doubtful intervals of the log beside a model's causes; None: there are none."""
+
+    def with_bridges(self, model: Model) -> Model:
+        """The model with rates in the doubtful intervals of the log; its scene is refitted to the ladder's pairs."""
+        return model if self.bridged is None else refitted(self.evidence, self.bridged(model), JUDGE_POINTS)[0]
 
     def candidates(self, model: Model, tried: set[str]) -> list[Candidate]:
         """All causes that are not in a model yet."""

@@ -29,6 +29,7 @@ from virest.diagnosis.field.brightness import (
     light_field,
     with_light_field,
 )
+from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
 from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
@@ -308,7 +309,9 @@ class DiagnosisSession:
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
         stated = [entry for field in fields for entry in field.fields]
-        with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in extended.fields]
+        withheld = [f for entry in self.geometric.fields if isinstance(entry, Distrusted) for f in entry.withheld]
+        kept = [held for held in extended.fields if not any(map(held.is_in_place_of, withheld))]
+        with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in kept]
         extended = extended.with_fields([held.rounded() for held in with_std])
         extended = with_unknowns_of(self.geometric, extended)
         # the stabiliser's lean belongs to the start of this log: a restoration that begins later must not use it

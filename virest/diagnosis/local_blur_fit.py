@@ -72,6 +72,9 @@ class BlurEffect(Protocol):
     def possible(self, values: Array) -> bool:
         """Whether fitted values are an estimate rather than a bound of the fit."""
 
+    def shows_in(self, observations: BlurObservations) -> Mask:
+        """Mask of the residuals that determine the effect."""
+
 
 @dataclass(frozen=True, slots=True)
 class ExposureTime:
@@ -102,6 +105,10 @@ class ExposureTime:
         low, high = _EXPOSURE_SCALES
         return low < float(values[0]) < high
 
+    def shows_in(self, observations: BlurObservations) -> Mask:
+        """The spectra: edges are chosen where motion is short."""
+        return ~observations.is_edge
+
 
 @dataclass(frozen=True, slots=True)
 class Defocus:
@@ -127,6 +134,10 @@ class Defocus:
     def possible(self, values: Array) -> bool:
         """Always: zero defocus is a valid estimate."""
         return True
+
+    def shows_in(self, observations: BlurObservations) -> Mask:
+        """The edges: ratios of spectra between frames lack a blur that all frames share."""
+        return observations.is_edge
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,14 +207,18 @@ def judge(observations: BlurObservations, found: BlurFit, trajectory: Trajectory
 
 def held_out(
     observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory, effects: Sequence[BlurEffect]
-) -> HeldOutGain:
-    """Robust rms, px, without and with the effects, fitted to every other time block and judged on the rest."""
+) -> list[HeldOutGain]:
+    """Robust rms, px, without and with the effects, fitted to every other time block and judged on the rest.
+
+    Each effect is judged on the residuals that determine it: the other kind outnumbers them, and hides its gain.
+    """
     folds = []
     for fitted in halves(time_blocks(observations.time_s)):
         fits = [fit(observations, profile, trajectory, chosen, fitted) for chosen in ((), effects)]
-        before_px, after_px = (judge(observations, one, trajectory, ~fitted) for one in fits)
-        folds.append((before_px, after_px, 0.0))
-    return replace(HeldOutGain.of_folds(BLUR, folds), noise=None)
+        masks = [~fitted & effect.shows_in(observations) for effect in effects]
+        folds.append([tuple(judge(observations, one, trajectory, mask) for one in fits) for mask in masks])
+    gains = (HeldOutGain.of_folds(BLUR, [(*pair, 0.0) for pair in own]) for own in zip(*folds, strict=True))
+    return [replace(gain, noise=None) for gain in gains]
 
 
 @dataclass(frozen=True, slots=True)

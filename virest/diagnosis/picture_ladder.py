@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -219,42 +219,53 @@ def _rung(
     Returns (rung, cause that enters or None, its fit).  notes: receives a note if brightness changes from frame to
     frame, but not by one gain for the whole frame.
     """
-    before = normalised_rms(observations.with_memory(plain.memory), plain.profile)[0]
     others = [e for e in effects if e not in accepted]
     found = each(fit_photometry, [(observations, nominal, [*accepted, e]) for e in others])
     fits = {e.name: fitted for e, fitted in zip(others, found, strict=True)}
-    tried = {name: fitted.rms for name, fitted in fits.items()}
     size = np.log(max(len(observations), 2))
     order = sorted(fits, key=lambda name: fits[name].cost + 0.5 * size * len(fits[name].of(name)[0]))
-    nothing = Rung(None, tried, before, PHOTOMETRY)
+    judged: dict[str, HeldOutGain] = {}
     for name in order[:2]:
         effect = next(e for e in effects if e.name == name)
         p_value = significance(fits[name], name, observations, nominal)[1]
         low_memory = name not in CURVE or fits[name].memory <= MAX_CURVE_MEMORY
         if fits[name].cost >= plain.cost or not LIGHT_LEVELS.significant(p_value) or not low_memory:
             continue
-        if _holds(observations, nominal, accepted, effect, each):
-            return replace(nothing, entered=name), effect, fits[name]
+        judged[name], holds = _judged(observations, nominal, accepted, effect, each)
+        if holds:
+            return _record(judged, name, plain), effect, fits[name]
         if effect.per_frame and notes is not None:
             notes.append(UNEVEN)
-    return nothing, None, plain
+    return _record(judged, None, plain), None, plain
 
 
-def _holds(
+def _record(judged: dict[str, HeldOutGain], entered: str | None, plain: PhotometricFit) -> Rung:
+    """The rung: the causes that were judged on the same held-out halves as the one that enters, or as the first."""
+    if not judged:
+        return Rung(entered, {}, plain.rms, PHOTOMETRY)
+    chosen = judged[entered or next(iter(judged))]
+    tried = {name: gain.after for name, gain in judged.items() if np.isclose(gain.before, chosen.before)}
+    return Rung(entered, tried, chosen.before, PHOTOMETRY)
+
+
+def _judged(
     observations: PhotometricObservations,
     nominal: CameraProfile,
     accepted: Sequence[PhotometricEffect],
     effect: PhotometricEffect,
     each: ParallelMap,
-) -> bool:
-    """Whether an added effect gains on held-out sides, and on held-out times unless an effect has values per frame."""
-    effects = [*accepted, effect]
+) -> tuple[HeldOutGain, bool]:
+    """(held-out gain, whether an added effect gains on held-out sides, and on held-out times).
+
+    Sides are the only test where an effect has values per frame.
+    """
+    effects, gains = [*accepted, effect], []
     for by_side in (False, True)[any(e.per_frame for e in effects) :]:
-        held_out = judge(observations, nominal, effects, each, beside=accepted, by_side=by_side)
-        log.debug("%s, by side %s: %.3f -> %.3f", effect.name, by_side, held_out.before, held_out.after)
-        if not (FRAME_LEVELS if effect.per_frame else LIGHT_LEVELS).gains(held_out):
-            return False
-    return True
+        gains.append(judge(observations, nominal, effects, each, beside=accepted, by_side=by_side))
+        log.debug("%s, by side %s: %.3f -> %.3f", effect.name, by_side, gains[-1].before, gains[-1].after)
+        if not (FRAME_LEVELS if effect.per_frame else LIGHT_LEVELS).gains(gains[-1]):
+            return gains[0], False
+    return gains[0], True
 
 
 def _still_needed(
@@ -418,8 +429,8 @@ def climb_blur(
             "not reported as a cause"
         )
     if named:
-        held = local_blur_fit.held_out(observations, profile, trajectory, tuple(effects[k] for k in named))
-        for k in named:
+        gains = local_blur_fit.held_out(observations, profile, trajectory, tuple(effects[k] for k in named))
+        for k, held in zip(named, gains, strict=True):
             name, change = effects[k].name, found[k].parameter
             changes = {effects[k].parameters[0]: change}
             p_value = _blur_p_value(name, found[k].deviations)

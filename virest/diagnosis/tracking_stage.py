@@ -12,7 +12,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.candidates import FarStart
-from virest.diagnosis.field.bridging import doubtful_pairs, with_bridges, with_description
+from virest.diagnosis.field.bridging import Bridges, doubtful_pairs, with_bridges
 from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import make_evidence
@@ -106,18 +106,17 @@ class TrackedPoints:
 
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
         doubtful = doubtful_pairs(observed, self.capture, self.start)
-        rest = observed.chosen(~doubtful.hit) if doubtful.sets_aside else observed
-        evidence = make_evidence(self.capture.imu, rest)
+        evidence = make_evidence(self.capture.imu, doubtful.for_ladder(observed), self.start)
+        bridges = None
+        if self.rungs_allowed and doubtful.stretches:
+            bridges = Bridges.over(doubtful, observed, self.capture, self.start)
         found = climb(
-            evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed, self.each
-        )
+            evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed, self.each,
+            None if bridges is None else bridges.refitted,
+        )  # fmt: skip
         found.evidence = evidence
-        if not self.rungs_allowed:
-            return found
-        if doubtful.sets_aside:
-            with_bridges(found, observed, doubtful, self.capture)
-        elif doubtful.hit.any():
-            with_description(found, evidence, doubtful, self.capture)
+        if bridges is not None:
+            with_bridges(found, bridges, self.capture)
         return found
 
 

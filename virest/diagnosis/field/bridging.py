@@ -1,4 +1,9 @@
-"""Test the points in untrusted log intervals, and bridge those intervals with rates estimated from the points."""
+"""Bridge untrusted log intervals with rates estimated from the points, and test the points inside them.
+
+An interval turns everything after it against everything before: gravity, which is subtracted from the accelerations,
+then seems to change its direction.  The ladder therefore climbs with bridges from its first rung, even though the pairs
+that overlap an interval are excluded from it.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from virest.camera.field import Field
+from virest.camera.field import AXES, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
+from virest.diagnosis.cross_validation import JUDGE_POINTS
+from virest.diagnosis.field.forms import FieldForm
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.stretches import bridging_form, rate_walk, touching
-from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, make_evidence
+from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, fit_model, make_evidence
 from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
-from virest.image_formation.point_model import TrackTable, integrate_motion
+from virest.image_formation.point_model import TrackTable, integrate_motion, seen_s
+from virest.inference.comparable_noise import noise_distances
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.observed_tracks import ObservedTracks
-from virest.inference.track_fit import start_scene
+from virest.inference.track_fit import Term, TrackFit, for_table, start_scene
 from virest.motion.scene_motion import InertialMotion
 
 Array = NDArray[np.float64]
@@ -43,149 +51,146 @@ class Doubtful:
     hit: Mask
     """(pairs,)."""
 
-    @property
-    def sets_aside(self) -> bool:
-        """Whether enough unaffected pairs remain for the ladder."""
-        return bool(self.hit.any() and (~self.hit).sum() >= LEAST_PAIRS_LEFT)
+    def for_ladder(self, observed: ObservedTracks) -> ObservedTracks:
+        """The unaffected pairs for the ladder; all pairs if fewer than LEAST_PAIRS_LEFT are unaffected."""
+        return observed.chosen(~self.hit) if (~self.hit).sum() >= LEAST_PAIRS_LEFT else observed
 
 
 def doubtful_pairs(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> Doubtful:
-    """Find the pairs that overlap log intervals which do not look like gyroscope data."""
-    to_imu = (1 + profile.clock_skew, profile.time_offset_s or 0.0)
-    found = doubtful_stretches(capture.imu)
+    """Find the pairs that overlap log intervals that do not look like gyroscope data and that no field bridges."""
+    to_imu = _to_imu(profile)
+    found = (s for s in doubtful_stretches(capture.imu) if not profile.bridges(s.from_s, s.to_s))
     seen = [stretch for stretch in found if touching(observed, [stretch], to_imu).any()]
     return Doubtful(tuple(seen), touching(observed, seen, to_imu))
 
 
-def with_bridges(found: GeometricVerdict, observed: ObservedTracks, doubtful: Doubtful, capture: Capture) -> None:
-    """Test the excluded pairs, and add to the verdict what their points show about the doubtful intervals."""
-    evidence = make_evidence(capture.imu, observed)
-    model = replace(found.model, terms=())
-    table = evidence.table(model, FINAL_POINTS)
-    model = _with_scene(evidence, model, table)
+@dataclass(frozen=True, slots=True)
+class Bridges:
+    """Doubtful intervals with all pairs that see them, and the form of the rates there."""
+
+    evidence: Evidence
+    """All pairs."""
+    doubtful: Doubtful
+    form: FieldForm
+
+    @staticmethod
+    def over(doubtful: Doubtful, observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> Bridges:
+        """The bridges over some intervals; profile: its clocks are those of the intervals' pairs."""
+        form = bridging_form(doubtful.stretches, capture.stamp_0_ns, rate_walk(capture.imu))
+        return Bridges(make_evidence(capture.imu, observed, profile), doubtful, form)
+
+    def without(self, model: Model) -> Model:
+        """The model without bridges."""
+        return replace(model, profile=self.form.removed_from(model.profile))
+
+    def fitted(self, model: Model, table: TrackTable) -> TrackFit:
+        """Fit bridges, from 0, beside a model's terms and scene; without covariances."""
+        bare = self.without(model)
+        return fit_model(self.evidence.imu, bare, (*bare.terms, self.form.term), table, covariances=False)
+
+    def refitted(self, model: Model) -> Model:
+        """The model with bridges fitted to all pairs beside its terms and scene."""
+        table = self.evidence.table(model, JUDGE_POINTS)
+        return replace(model, profile=self.fitted(_with_scene(self.evidence, model, table), table).profile)
+
+
+def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) -> None:
+    """Test the pairs in the intervals, and add to the verdict what their points show about the intervals."""
+    evidence, stretches, hit = bridges.evidence, bridges.doubtful.stretches, bridges.doubtful.hit
+    table, terms, typical = evidence.table(found.model, FINAL_POINTS), found.model.terms, evidence.typical_px
+    bare = bridges.without(_with_scene(evidence, replace(found.model, terms=()), table))
     spread = found.fit.depth_spread_per_m
-    before = distances(capture.imu, fit_model(capture.imu, model, (), table), table, spread)
-    hit = doubtful.hit[table.pair]
-    p_value = _larger_residual_p(before, table, doubtful.hit)
-    if p_value > MAX_P:
+    before = evidence.distances(evidence.fit(bare, (), table), table, spread)
+    p_value = None if hit.all() else _larger_residual_p(before, table, hit)
+    if p_value is not None and p_value > MAX_P:
         found.notes.append(
-            f"{len(doubtful.stretches)} stretches of the inertial log look {doubtful.stretches[0].kind}; "
+            f"{len(stretches)} stretches of the inertial log look {stretches[0].kind}; "
             "tracked points do not confirm it, and their frames were excluded from the fits"
         )
+        rest = make_evidence(evidence.imu, bridges.doubtful.for_ladder(evidence.observed), bare.profile)
+        _refit(found, rest, bridges.without(found.model), terms)
         return
-    half = np.arange(len(table)) % 2 == 0
-    held_out = np.zeros(len(table))
+    half, after = np.arange(len(table)) % 2 == 0, np.zeros(len(table))
     for part in (half, ~half):
-        bridged = _bridged(evidence, model, table.chosen(part & hit), doubtful.stretches, capture)
-        held_out[~part] = distances(
-            capture.imu, fit_model(capture.imu, bridged, (), table.chosen(part)), table, spread
-        )[~part]
-    typical = evidence.typical_px
-    rest = capped_rms(before[~hit])
-    to_imu = (1 + model.profile.clock_skew, model.profile.time_offset_s or 0.0)
-    good = [
-        s for s in doubtful.stretches if _holds(before, held_out, rest, touching(observed, [s], to_imu)[table.pair])
-    ]
-    bad = [s for s in doubtful.stretches if s not in good]
-    trusted = ~touching(observed, bad, to_imu) if bad else np.ones(len(doubtful.hit), bool)
-    if good:
-        good = _take_over(found, evidence.observed.chosen(trusted), good, model, capture)
-    untrusted = tuple((s.from_s, s.to_s) for s in doubtful.stretches)
-    profile = replace(found.model.profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
+        fitted = bridges.fitted(bare, table.chosen(part))
+        after[~part] = evidence.distances(fitted, table, spread)[~part]
+    noise = noise_distances(evidence.observed, fitted)
+    pair = np.repeat(np.arange(len(hit)), [len(pair) for pair in evidence.observed.pairs])
+
+    def rms_px(pairs: Mask) -> Array:
+        """Rms (3,) without bridges, with bridges on held-out points, and of tracking noise."""
+        inside = pairs[table.pair]
+        return typical * np.array([capped_rms(d) for d in (before[inside], after[inside], noise[pairs[pair]])])
+
+    near = np.array([touching(evidence.observed, [stretch], _to_imu(bare.profile)) for stretch in stretches])
+    holds = np.array([_holds(*rms_px(pairs)) for pairs in near])
+    trusted = ~near[~holds].any(axis=0)
+    kept = evidence.observed.chosen(trusted) if trusted.sum() >= LEAST_PAIRS_LEFT else evidence.observed
+    _refit(found, make_evidence(evidence.imu, kept, bare.profile), bare, (*terms, bridges.form.term))
+    profile, form = found.model.profile, bridges.form
+    part_of = found.fit.slices[form.name]
+    covariance = found.fit.covariance[part_of, part_of]
+    std = form.filled(np.zeros(len(covariance)), covariance)
+    fields = (replace(form.held_in(profile, own), std=own.std) for own in std)
+    accurate = blur_std_px(found.fit, found.table, form, covariance) < MAX_BLUR_STD_PX
+    untrusted = tuple((s.from_s, s.to_s) for s in stretches)
+    profile = replace(profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
     found.model = replace(found.model, profile=profile)
     found.fields.append(
-        Distrusted(
-            doubtful.stretches,
-            tuple(s in good for s in doubtful.stretches),
-            p_value,
-            _rms(before[hit]) * typical,
-            _rms(held_out[hit]) * typical,
-            rest * typical,
-            profile,
-        )
+        Distrusted(stretches, tuple(fields), tuple((holds & accurate).tolist()), p_value, *map(float, rms_px(hit)))
     )
 
 
-def with_description(found: GeometricVerdict, evidence: Evidence, doubtful: Doubtful, capture: Capture) -> None:
-    """Describe doubtful intervals that affect too many pairs to be excluded from the fits."""
-    hit = doubtful.hit[found.table.pair]
-    p_value = _larger_residual_p(found.fit.distance, found.table, doubtful.hit) if not hit.all() else None
-    if p_value is not None and p_value > MAX_P:
-        return
-    untrusted = tuple((s.from_s, s.to_s) for s in doubtful.stretches)
-    profile = replace(found.model.profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
-    found.model = replace(found.model, profile=profile)
-    off_px, rest_px = (_rms(found.fit.distance[part]) * evidence.typical_px for part in (hit, ~hit))
-    found.fields.append(
-        Distrusted(doubtful.stretches, (False,) * len(doubtful.stretches), p_value, off_px, off_px, rest_px, profile)
-    )
+def _to_imu(profile: CameraProfile) -> tuple[float, float]:
+    return 1 + profile.clock_skew, profile.time_offset_s or 0.0
 
 
 def _with_scene(evidence: Evidence, model: Model, table: TrackTable) -> Model:
-    """The model with a scene for this table's windows."""
-    scene = model.scene
+    """The model with a scene for this table's pairs and windows."""
+    scene = for_table(model.scene, table)
     if not isinstance(scene, InertialMotion) or scene.windows == table.n_windows:
-        return model
+        return replace(model, scene=scene)
     known = integrate_motion(evidence.imu, model.profile, translation=True)
     depth = float(np.median(np.linalg.norm(scene.plane_per_m, axis=1)))
     return replace(model, scene=start_scene(evidence.imu, known, table, depth))
 
 
-def _bridged(
-    evidence: Evidence, model: Model, table: TrackTable, stretches: Sequence[Stretch], capture: Capture
-) -> Model:
-    """The model with rates in the intervals, fitted to the points of a table."""
-    form = bridging_form(stretches, capture.stamp_0_ns, rate_walk(capture.imu))
-    fitted = fit_model(evidence.imu, model, (form.term,), table)
-    return replace(model, profile=fitted.profile)
-
-
-def _take_over(
-    found: GeometricVerdict, observed: ObservedTracks, stretches: Sequence[Stretch], model: Model, capture: Capture
-) -> list[Stretch]:
-    """Refit everything with the bridges to all pairs trusted then; return the intervals whose bridges are accurate."""
-    evidence = make_evidence(capture.imu, observed)
-    to_imu = (1 + model.profile.clock_skew, model.profile.time_offset_s or 0.0)
-    table = evidence.table(model, FINAL_POINTS)
-    bridged = _bridged(
-        evidence, model, table.chosen(touching(observed, stretches, to_imu)[table.pair]), stretches, capture
-    )
-    form = bridging_form(stretches, capture.stamp_0_ns, rate_walk(capture.imu))
-    whole = replace(_with_scene(evidence, bridged, table), terms=(*found.model.terms, form.term))
-    fitted = fit_model(capture.imu, whole, whole.terms, table)
-    part = fitted.slices[form.name]
-    deviations = form.filled(np.zeros(part.stop - part.start), fitted.covariance[part, part])
-    accurate = [_blur_std_px(fitted.profile, field, evidence.exposure_s) < MAX_BLUR_STD_PX for field in deviations]
-    bridges = {field.knots: field for field in deviations}
-    inaccurate = {field.knots for field, holds in zip(deviations, accurate, strict=True) if not holds}
-    held = [
-        replace(field, std=bridges[field.knots].std) if field.knots in bridges else field
-        for field in fitted.profile.fields
-        if field.knots not in inaccurate
-    ]
-    found.model = replace(whole, profile=fitted.profile.with_fields(held), scene=fitted.scene)
+def _refit(found: GeometricVerdict, evidence: Evidence, start: Model, terms: Sequence[Term]) -> None:
+    """Refit a verdict from a model, with these terms, to other pairs."""
+    table = evidence.table(start, FINAL_POINTS)
+    start = replace(_with_scene(evidence, start, table), terms=tuple(terms))
+    fitted = evidence.fit(start, start.terms, table)
+    found.model = replace(start, profile=fitted.profile, scene=fitted.scene)
     found.fit, found.table, found.evidence = fitted, table, evidence
     found.final_rms_px = capped_rms(fitted.distance) * evidence.typical_px
     found.noise_px = evidence.noise_px(fitted)
-    return [stretch for stretch, holds in zip(stretches, accurate, strict=True) if holds]
 
 
-def _blur_std_px(profile: CameraProfile, bridge: Field, exposure_s: float) -> float:
-    """Largest standard deviation of the blur-path length caused by a bridge, px."""
-    lens = profile.intrinsics
+def blur_std_px(fitted: TrackFit, table: TrackTable, form: FieldForm, covariance: Array) -> Array:
+    """Largest standard deviation (bridges,) of the blur-path length of a point seen in a bridge, px.
+
+    Rates between two frames' exposures are uncertain but blur nothing.
+    """
+    profile, lens = fitted.profile, fitted.profile.intrinsics
     assert lens is not None
-    std_rad_s = float(np.linalg.norm(bridge.std, axis=1).max())
-    return std_rad_s * float(profile.shutter.true_exposure_s(exposure_s)) * lens.fx_px
+    exposure_s = np.asarray(profile.shutter.true_exposure_s(table.second_exposure_s))
+    first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
+    seen = np.concatenate([t + part * exposure_s for t in (first_s, fitted.seconds) for part in (-0.5, 0.0, 0.5)])
+    seen = np.unique(np.round(seen, 3))
+    ends = np.cumsum([np.size(field.values) for field in form.fields])[:-1]
+    found = []
+    for field, basis in zip(form.fields, np.split(form.basis, ends), strict=True):
+        knots = field.knots[0]
+        weight = cardinal_weights(knots, seen[(seen > knots[0]) & (seen < knots[-1])])
+        moved = np.einsum("tk,kan->tan", weight, basis.reshape(len(knots), len(AXES), -1))
+        variance = np.einsum("tan,nm,tam->t", moved, covariance, moved)
+        found.append(float(np.sqrt(variance.max(initial=0.0))))
+    return np.array(found) * float(np.median(exposure_s)) * lens.fx_px
 
 
-def _holds(before: Array, after: Array, rest: float, inside: Mask) -> bool:
+def _holds(before: float, after: float, noise: float) -> bool:
     """Whether bridging removes most of the excess residual of the points in an interval."""
-    was, now = _rms(before[inside]), _rms(after[inside])
-    return bool(now < MAX_RMS_RATIO * rest or now**2 - rest**2 < MAX_EXCESS_LEFT * (was**2 - rest**2))
-
-
-def _rms(distance: Array) -> float:
-    return float(np.sqrt(np.mean(distance**2) / 2)) if len(distance) else 0.0
+    return after < MAX_RMS_RATIO * noise or after**2 - noise**2 < MAX_EXCESS_LEFT * (before**2 - noise**2)
 
 
 def _larger_residual_p(distance: Array, table: TrackTable, hit: Mask) -> float:

@@ -107,6 +107,8 @@ class FieldForm:
         """The profile with these numbers added to its fields."""
         held = list(profile.fields)
         for field, values in zip(self.fields, self.values(numbers), strict=True):
+            if not values.any():
+                continue
             place = next((k for k, known in enumerate(held) if _adds_to(field, known)), None)
             if place is None:
                 held.append(field.with_values(values))
@@ -114,6 +116,10 @@ class FieldForm:
                 before = held.pop(place)
                 held.insert(place, field.with_values(values + _at_knots(before, field)))
         return profile.with_fields(held)
+
+    def removed_from(self, profile: CameraProfile) -> CameraProfile:
+        """The profile without these fields."""
+        return profile.with_fields([f for f in profile.fields if not any(map(f.is_in_place_of, self.fields))])
 
     @staticmethod
     def held_in(profile: CameraProfile, field: Field) -> Field:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from virest.camera.field import Field
-from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.forms import FieldForm
 from virest.inference.doubtful_log import Stretch
 from virest.inference.track_fit import TrackFit
@@ -44,8 +43,10 @@ class Distrusted:
     """Intervals of the inertial log that do not follow the frames."""
 
     stretches: tuple[Stretch, ...]
-    bridged: tuple[bool, ...]
-    """Whether the rates there were estimated from the points."""
+    bridges: tuple[Field, ...]
+    """Rates there, estimated from the points, with standard deviations."""
+    usable: tuple[bool, ...]
+    """Whether these rates explain the points and are accurate enough to restore frames."""
     p_value: float | None
     """For the hypothesis that residuals there are no larger than elsewhere; None: all pairs are affected."""
     before_px: float
@@ -53,6 +54,9 @@ class Distrusted:
     after_px: float
     """The same with rates estimated from the other points of these pairs."""
     noise_px: float
-    """Residual rms of the points elsewhere."""
-    profile: CameraProfile
-    """With the bridges."""
+    """The same due to tracking noise alone."""
+
+    @property
+    def withheld(self) -> tuple[Field, ...]:
+        """Bridges that join the motion on both sides of their interval, but are not accurate enough inside."""
+        return tuple(field for field, usable in zip(self.bridges, self.usable, strict=True) if not usable)

@@ -389,10 +389,8 @@ def _refined(evidence: Evidence, model: Model, entered: _Entered, fitted: TrackF
 
 def _without_form(model: Model, form: FieldForm) -> Model:
     """The model without a form, whose values return to 0."""
-    fields = form.filled(np.zeros(form.basis.shape[1]))
-    kept = [f for f in model.profile.fields if not any(f.is_in_place_of(own) for own in fields)]
     terms = tuple(term for term in model.terms if term.name != form.name)
-    return replace(model, profile=model.profile.with_fields(kept), terms=terms)
+    return replace(model, profile=form.removed_from(model.profile), terms=terms)
 
 
 def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool = False) -> HeldOut:

@@ -20,8 +20,10 @@ from virest.inference.observed_tracks import ObservedTracks
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-KNOT_STEP_S = 0.03
-"""Knot spacing of a bridge: about one frame, since a frame's points determine little more than its rotation."""
+KNOT_STEP_S = 0.015
+"""Knot spacing of a bridge.  What a clipped peak lacks starts with a kink between two readings: over the peaks of a
+hand at 1 to 2 rad/s, the angle of a spline with this spacing errs by 0.1 mrad in the median and 0.3 mrad at most, about
+a tracker's noise; with twice the spacing by 0.3 and 1.4 mrad."""
 
 
 def touching(observed: ObservedTracks, stretches: Iterable[Stretch], to_imu: tuple[float, float]) -> Mask:

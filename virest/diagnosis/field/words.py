@@ -116,7 +116,7 @@ UNIT_SCALES = {"delay": (1e3, "ms"), "displacement": (1.0, "px"), "scale": (100.
 def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding:
     """A field as a finding of the diagnosis."""
     if isinstance(entry, Distrusted):
-        return _distrusted(entry, noise_px)
+        return _distrusted(entry)
     fields, form = entry.fields, entry.form
     shape = shape_of(fields[0]) if len(fields) == 1 else _common_shape(fields)
     size, std = _size(fields)
@@ -151,7 +151,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     )
 
 
-def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
+def _distrusted(entry: Distrusted) -> FieldFinding:
     """Describe untrusted log intervals: their kind, the point residuals there, and whether they are bridged."""
     first = entry.stretches[0]
     total_s = sum(stretch.to_s - stretch.from_s for stretch in entry.stretches)
@@ -172,13 +172,12 @@ def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
         sentence = f"{where} the log does not follow the frames: inertial rows there lie on a straight line"
         reasons = "rows were lost and a program interpolated the gap, or the sensor's queue stalled"
         following = "look at the raw log for rows with equal steps, and record with less load on the phone"
-    bridged = "bridged from the points" if all(entry.bridged) else "not corrected by process"
+    usable = sum(entry.usable)
+    bridged = "bridged from the points" if all(entry.usable) else "not corrected by process"
+    if 0 < usable < len(entry.usable):
+        bridged = f"{usable} of {len(entry.usable)} bridged from the points, the others {bridged}"
     description = f"{sentence} (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out; {bridged})"
-    if not any(entry.bridged):
-        description = f"{sentence} (point residual {entry.before_px:.3g} px there; {bridged})"
-    bridges = tuple(
-        f for f in entry.profile.fields if f.kind == "rate" and f.covariates == ("time",) and f.belongs_to_one_capture
-    )
+    bridges = tuple(field for field, usable in zip(entry.bridges, entry.usable, strict=True) if usable)
     size = max((float(np.abs(f.values).max()) for f in bridges), default=None)
     return FieldFinding(
         ("rate",) if first.kind == CLIPPED else ("time",),
@@ -188,7 +187,7 @@ def _distrusted(entry: Distrusted, noise_px: float) -> FieldFinding:
         size,
         "rad/s",
         None,
-        HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, noise_px),
+        HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, entry.noise_px),
         entry.p_value,
         (),
         None,
