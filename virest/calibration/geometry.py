@@ -393,7 +393,8 @@ def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names
             break
     corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
     if corrected:  # without an accelerometer the blur due to translation is unknown
-        table = replace(table, second_px=table.second_px - blur_bias_px(fit.integrated, table))
+        guided = np.array([pair.guided for pair in observed.pairs])
+        table = replace(table, second_px=table.second_px - blur_bias_px(fit.integrated, table, guided))
         fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene)
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)
