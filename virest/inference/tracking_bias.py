@@ -17,7 +17,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.inference.blur_bias import RELATIVE_STD
 from virest.inference.track_fit import TrackFit
 
 Array = NDArray[np.float64]
@@ -97,14 +96,13 @@ GYRO_WANDER_RAD_S = 5e-5
 """Bias instability of phones' gyroscopes: 10 degrees an hour (data sheets of BMI160, LSM6DSO, ICM-20602: 3 to 10)."""
 
 
-def remaining_std(fit: TrackFit, name: str, moved: Array, gyro_mean_std_rad_s: float) -> Array:
-    """Standard deviation (k,) of a term's remaining bias, from points without the blur bias.
+def remaining_std(fit: TrackFit, name: str, gyro_mean_std_rad_s: float) -> Array:
+    """Standard deviation (k,) of a term's remaining bias, from points without the mean bias of blur and encoder.
 
-    moved (k,): change of the values by that correction.  gyro_mean_std_rad_s: standard deviation of the mean gyroscope
-    noise over the capture.
+    gyro_mean_std_rad_s: standard deviation of the mean gyroscope noise over the capture.
     """
     own = fit.slices[name]
-    std = np.hypot(np.hypot(shared_std(fit, name), RELATIVE_STD * moved), fit.by_coding[own])
+    std = np.hypot(shared_std(fit, name), fit.by_coding_left[own])
     if name == "gyro_bias":
         wander = np.hypot(GYRO_WANDER_RAD_S, gyro_mean_std_rad_s)
         return np.asarray(np.hypot(np.hypot(std, wander), SHARED_RELIEF * fit.by_relief[own]))
