@@ -18,7 +18,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, with_profile
-from virest.inference.clustered import CovarianceModel, Index, scatter
+from virest.inference.clustered import CovarianceModel, Index, adjusted_sums, scatter
 from virest.inference.coded_motion import DEVIATION, USUAL, drawn_px, step_slopes
 from virest.inference.descent import MAX_ITERATIONS, descend, slices
 from virest.inference.profile_curvature import at_profile_minimum
@@ -265,9 +265,15 @@ def _covariance_model(
     moved = system.score @ inverse / bend
     region = _regions(table.first_px)
     by_region = scatter(moved, region, about_mean=True) - scatter(moved, block * REGIONS**2 + region, about_mean=True)
-    return CovarianceModel(
-        inverse, scatter(moved, block, about_mean=True), by_region, inverse @ (system.prior[:, None] * inverse)
-    )
+    sums = adjusted_sums(system.score, _normal_by_block(system, block, count), block) @ inverse / bend
+    return CovarianceModel(inverse, sums.T @ sums, by_region, inverse @ (system.prior[:, None] * inverse))
+
+
+def _normal_by_block(system: TrackSystem, block: Index, blocks: int) -> Array:
+    """Each block's part (blocks, k, k) of the curvature."""
+    rows = system.rows * np.sqrt(system.weight / np.square(system.scale))[:, None, None]
+    parts = (rows[block == number].reshape(-1, rows.shape[-1]) for number in range(blocks))
+    return np.stack([part.T @ part for part in parts])
 
 
 def _moved_by(evidence: TrackEvidence, system: TrackSystem, inverse: Array, errors_px: Array | None) -> Array:
