@@ -37,8 +37,8 @@ times; and from the curved part of the flow to its affine part.  ``python -m vir
 them."""
 USUAL = np.hypot(MEAN, DEVIATION)
 """Root mean square of the fractions."""
-MOST_ERROR_PX = 0.06
-"""Largest error found, at 0.16 px of noise; noise above that has other causes than the encoder."""
+MOST_NOISE_PX = 0.16
+"""Largest noise at which the encoder's errors were measured; noise above that has other causes, mostly blur."""
 BLOCK_PX = 16.0
 """Side of a block: the largest distance over which motion is predicted."""
 LEAST_SLOPE = 1e-4
@@ -96,8 +96,7 @@ def _beyond_affine(points_px: Array, steps_px: Array, pair: NDArray[np.intp]) ->
 
 def drawn_px(slopes: StepSlopes, noise_px: Array, bits_per_px: float) -> Array:
     """Errors (5, n, 2) of steps, of the usual size each, in the order of MEAN.  noise_px: (n,) of a step."""
-    level_px = noise_px * np.sqrt(BITS_PER_PX / bits_per_px)
-    error_px = np.minimum(USUAL[:, None] * level_px, MOST_ERROR_PX)
+    error_px = USUAL[:, None] * np.minimum(noise_px, MOST_NOISE_PX) * np.sqrt(BITS_PER_PX / bits_per_px)
     steepness = _rms(slopes.at_once + slopes.by_rows)[:, None]
     away_px = np.minimum(error_px[:4].reshape(2, 2, -1) / np.maximum(steepness, LEAST_SLOPE), BLOCK_PX)
     pulled = -away_px[..., None] * np.stack([slopes.at_once, slopes.by_rows])

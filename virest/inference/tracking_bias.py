@@ -77,11 +77,11 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
 
 # ── points without the bias of their blur ────────────────────────────────────────────────────────────────────────
 
-STILL_SHARED = {"readout_time": 0.012, "focal_length": 0.014}
+STILL_SHARED = {"readout_time": 0.014, "focal_length": 0.021, "principal_point": 0.014}
 STILL_SHARED_OTHER = 0.007
 """Fraction of a step's noise that is correlated with a value's own pattern after the mean bias of blur and encoder is
-removed: of the readout, of the focal length, and of any other value.  Values of 55 captures, a quarter each of them
-quiet, fast, coded at about 0.1 bits per pixel, and drawn like those of ``python -m virest.app.bench --only
+removed: for three values, and for any other.  The most likely fractions in 57 captures, a quarter each of them quiet,
+fast, coded at about 0.1 bits per pixel, and drawn like those of ``python -m virest.app.bench --only
 calibration``; that command prints the values for its captures."""
 GYRO_WANDER_RAD_S = 5e-5
 """Bias instability of phones' gyroscopes: 10 degrees an hour (data sheets of BMI160, LSM6DSO, ICM-20602: 3 to 10)."""
