@@ -77,10 +77,10 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
 
 # ── points without the bias of their blur ────────────────────────────────────────────────────────────────────────
 
-STILL_SHARED = {"readout_time": 0.014, "focal_length": 0.021, "principal_point": 0.014}
-STILL_SHARED_OTHER = 0.007
+STILL_SHARED = {"readout_time": 0.014, "focal_length": 0.026, "principal_point": 0.014}
+STILL_SHARED_OTHER = 0.008
 """Fraction of a step's noise that is correlated with a value's own pattern after the mean bias of blur and encoder is
-removed: for three values, and for any other.  The most likely fractions in 57 captures, a quarter each of them quiet,
+removed: for three values, and for any other.  The most likely fractions in 81 captures, a quarter each of them quiet,
 fast, coded at about 0.1 bits per pixel, and drawn like those of ``python -m virest.app.bench --only
 calibration``; that command prints the values for its captures."""
 GYRO_WANDER_RAD_S = 5e-5
