@@ -231,6 +231,19 @@ def test_a_focal_length_that_makes_up_for_a_gyroscope_s_scale_is_said(shaken: Pa
             assert float(notes[0].split("gyro-scale (")[1].split("%")[0]) == pytest.approx(-1.96, abs=0.4)
 
 
+def test_a_wrong_fixed_focal_length_is_blamed_and_not_the_motion(shaken: Path, tmp_path: Path) -> None:
+    """Half the focal length leaves a residual that hides the other values; what is said leads to the cause."""
+    true_px = read_profile(shaken / "camera.yaml").intrinsics.fx_px
+    start_profile(shaken, intrinsics__fx_px=0.5 * true_px, intrinsics__fy_px=0.5 * true_px)
+    facts, _ = run_calibration(plan_calibration(shaken), CalibrationOutput(tmp_path / "camera.yaml"))
+    assert facts["not_determined"]
+    assert "motion" not in facts["verdict"]
+    assert "focal" in facts["verdict"]
+    (note,) = (note for note in facts["notes"] if "intrinsics.fx_px" in note)
+    assert "--with focal" in note
+    assert not any("record a few more seconds" in note for note in facts["notes"])
+
+
 def test_a_value_that_no_phone_has_is_no_finding(shaken: Path, tmp_path: Path) -> None:
     """Rates logged 1.3 times too large are well determined, and still no gyroscope's scale: nothing is taken over."""
     table = shaken / "gyro_accel.csv"

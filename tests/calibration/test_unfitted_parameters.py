@@ -66,6 +66,17 @@ def test_what_no_phone_can_be_is_a_sign_of_something_else() -> None:
     assert "--with" not in note
 
 
+def test_a_focal_length_of_another_resolution_is_named_as_such() -> None:
+    """No lens is off by half, but a profile may be; other values that are off beside it are no reason to doubt that."""
+    values = {**held("focal", np.log(2.0), 0.005), **held("distortion", 0.05, 0.002)}
+    (note,) = held_notes(values, ["clock-skew"])
+    assert "focal (+100.0%" in note
+    assert "--with clock-skew,focal" in note
+    assert "resolution" in note
+    (other,) = held_notes({**values, **held("exposure-scale", -3.1, 0.1)}, ())
+    assert "virest diagnose" in other
+
+
 @pytest.mark.parametrize(
     ("change", "std", "said"),
     [(0.04, 0.01, "is absorbing a wrong gyro-scale"), (0.01, 0.02, "depends on gyro-scale"), (0.01, 0.005, None)],

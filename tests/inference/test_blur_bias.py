@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from virest.inference.blur_bias import matched_shift_px
+from virest.inference.guidance import NODES, MapBetween, applied_blur
 from virest.inference.tracking import track_pairs
 
 Array = np.ndarray
@@ -53,12 +54,52 @@ def test_steps_of_blurred_points_are_too_short_as_predicted(seed: int) -> None:
     assert abs(after[1]) < 0.7 * abs(before[1])
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_guide_that_blurs_the_sharper_picture_leaves_less_bias(seed: int) -> None:
+    """The errors of guided points are those predicted with the added blur, and smaller than those without."""
+    rng = np.random.default_rng(seed)
+    texture, error, predicted, unguided = _letters(rng), [], [], []
+    for _ in range(PAIRS):
+        first, second, step = _hand(rng)
+        guide = _Guide(step, np.cov(first.T), np.cov(second.T))
+        pictures = enumerate((_blurred(texture, first), _blurred(texture, second + step)))
+        (pair,) = track_pairs(pictures, guide=guide)
+        assert pair.guided
+        found = pair.points_second_px - pair.points_first_px - step - second.mean(axis=0) + first.mean(axis=0)
+        paths = _speed_and_bend(first), _speed_and_bend(second)
+        error.append(found)
+        predicted.append(np.broadcast_to(matched_shift_px(*paths, guide.added[None]), found.shape))
+        unguided.append(np.broadcast_to(matched_shift_px(*paths), found.shape))
+    error, predicted, unguided = map(np.concatenate, (error, predicted, unguided))
+    own, others = (_slopes(error, shift, np.zeros_like(error))[0] for shift in (predicted, unguided))
+    assert abs(own - 1) < 0.45
+    assert others < 0.5
+
+
+class _Guide:
+    """Knows the step between two pictures and the covariances of their blur."""
+
+    def __init__(self, step: Array, first: Array, second: Array) -> None:
+        self.step, self.lacks = step, (applied_blur(second - first), applied_blur(first - second))
+
+    @property
+    def added(self) -> Array:
+        """Covariance of the blur added to either picture."""
+        return self.lacks[0] + self.lacks[1]
+
+    def seen_before(self, _first: int, _second: int, shape: tuple[int, int], _factor: int) -> MapBetween:
+        """The map between the two pictures."""
+        shift = np.zeros((NODES, NODES, 2))
+        shift[0, 0] = -self.step
+        return MapBetween(shift, shape, *self.lacks)
+
+
 def _slopes(error: Array, steps: Array, bends: Array) -> Array:
     """Parts (2,) of steps and of shifts by acceleration that errors are, by robust weights."""
     distance = np.linalg.norm(error, axis=1)
     weight = np.repeat(1 / (1 + (distance / (2 * np.median(distance))) ** 2), 2)
     rows = np.stack([steps.ravel(), bends.ravel()], axis=-1)
-    return np.linalg.solve((rows * weight[:, None]).T @ rows, (rows * weight[:, None]).T @ error.ravel())
+    return np.linalg.lstsq(rows * weight[:, None] ** 0.5, error.ravel() * weight**0.5, rcond=None)[0]
 
 
 def _hand(rng: np.random.Generator, frame_s: float = 1 / 30, exposure_s: float = 0.013) -> tuple[Array, Array, Array]:

@@ -14,7 +14,7 @@ from virest.errors import ImuError
 from virest.image_formation.point_model import integrate_motion, predict
 from virest.inference import profile_terms as terms_of
 from virest.inference.clustered import CovarianceModel
-from virest.inference.coded_motion import StepSlopes, drawn_px, step_slopes
+from virest.inference.coded_motion import StepSlopes, coding_bias_px, drawn_px, step_slopes
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import InertialMotion
@@ -313,17 +313,17 @@ def test_steps_of_the_rows_above_are_within_the_deviation(term: Term, read: str)
     Whichever of offset, readout and skew is fitted, its deviation holds that.
     """
     recording = recorded(replace(LANDSCAPE, readout_direction=read, gyro_noise_rad_s=0.0, noise_px=0.15, frames=60))
-    table, profile = recording.table(), recording.profile
+    table, profile = replace(recording.table(), bits_per_px=0.1), recording.profile
     known = integrate_motion(recording.imu, profile, translation=False)
     slopes = step_slopes(known, table, None, predict(known, table, None))
-    drawn = drawn_px(slopes, table.noise_px[table.pair])[3]
+    drawn = drawn_px(slopes, table.noise_px[table.pair], table.bits_per_px)[3]
     fits = [
         fit_tracks(recording.imu, replace(table, second_px=table.second_px + shift), profile, (term,))
         for shift in (0.0, drawn)
     ]
     moved = float(fits[1].change[0] - fits[0].change[0])
     bias, coded = bias_std(fits[1], term.name, 0.15)[0], fits[1].by_coding[0]
-    assert abs(moved) > 2 * np.sqrt(bias**2 - coded**2)
+    assert abs(moved) > 1.2 * np.sqrt(bias**2 - coded**2)
     assert abs(moved) < 1.1 * bias
     if term is terms_of.TIME_OFFSET:
         assert (moved < 0) == (read == "top_to_bottom")
@@ -346,7 +346,39 @@ def test_what_a_still_camera_centre_explains_is_apart_from_the_rows_times() -> N
 
 def test_steps_that_go_alike_everywhere_are_not_drawn() -> None:
     """Without a slope nothing is off; where it is small, by no more than a block's side."""
-    none, little = np.zeros((2, 5, 2)), np.full((2, 5, 2), 1e-3)
-    assert not drawn_px(StepSlopes(none, none), np.full(5, 0.2)).any()
-    slight = drawn_px(StepSlopes(little, none), np.full(5, 0.5))
+    none, little, even = np.zeros((2, 5, 2)), np.full((2, 5, 2), 1e-3), np.zeros((5, 2))
+    assert not drawn_px(StepSlopes(none, none, even), np.full(5, 0.2), 0.1).any()
+    slight = drawn_px(StepSlopes(little, none, even), np.full(5, 0.5), 0.1)
     assert np.abs(slight).max() <= 16e-3
+
+
+def test_coding_bias_follows_the_bit_rate() -> None:
+    """A quarter of the bit rate doubles every bias; pictures that no encoder has touched have none."""
+    rng = np.random.default_rng(5)
+    slopes, noise_px = StepSlopes(*rng.normal(0, 0.01, (2, 2, 5, 2)), rng.normal(0, 0.5, (5, 2))), np.full(5, 0.05)
+    coarse, fine, uncoded = (drawn_px(slopes, noise_px, bits) for bits in (0.1, 0.4, np.inf))
+    assert np.abs(fine).max() > 1e-4
+    np.testing.assert_allclose(coarse, 2 * fine)
+    assert not uncoded.any()
+
+
+def test_coding_flattens_a_lens() -> None:
+    """A flow with less curvature looks like a smaller k1; the correction by the mean error restores the value."""
+    recording = recorded(replace(LANDSCAPE, gyro_noise_rad_s=0.0, noise_px=0.1, clock_skew=0.0))
+    table, profile = replace(recording.table(), bits_per_px=0.1), recording.profile
+    known = integrate_motion(recording.imu, profile, translation=False)
+    slopes = step_slopes(known, table, None, predict(known, table, None))
+    basis = np.stack([np.ones(len(table)), *table.first_px.T], axis=-1)[table.pair == 3]
+    assert np.abs(basis.T @ slopes.curved_px[table.pair == 3]).max() < 1e-6 * len(basis) * 640
+    bias_px = coding_bias_px(known, table, None)
+    terms = (terms_of.FOCAL, terms_of.K1)
+    clean, coded = (
+        fit_tracks(recording.imu, replace(table, second_px=table.second_px + shift), profile, terms)
+        for shift in (0.0, bias_px)
+    )
+    moved = coded.change - clean.change
+    assert moved[1] < -0.5 * coded.by_coding[1]
+    assert abs(moved[1]) < coded.by_coding[1]
+    assert coded.by_coding_left[1] < coded.by_coding[1]
+    predicted = fit_tracks(recording.imu, table, profile, terms, errors_px=bias_px[None]).by_error
+    np.testing.assert_allclose(predicted, np.abs(moved), rtol=0.05, atol=1e-6)

@@ -111,7 +111,7 @@ def observed_pairs(pairs: list[TrackPair], stamp_s: Array, exposure_s: Array, pr
     """Tracked pairs of a movie without a capture folder."""
     times = zip(stamp_s, exposure_s, strict=True)
     frames = tuple(Frame(k, k, float(t), None if np.isnan(e) else float(e)) for k, (t, e) in enumerate(times))
-    return observe_tracks(SimpleNamespace(frames=frames), pairs, profile)  # type: ignore[arg-type]
+    return observe_tracks(SimpleNamespace(frames=frames, bits_per_px=np.inf), pairs, profile)  # type: ignore[arg-type]
 
 
 def make(setup: Setup, imu_hz: float = 200.0) -> Synthetic:

@@ -34,6 +34,7 @@ EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
 MAX_FRAMES = 400
 """Captures up to this length (13 s at 30 frames/s) use every frame; longer ones use runs with this total."""
 FIT_STEPS = 3
+MORE_MOTION = "record a few more seconds while rotating the phone about all three axes"
 UNEXPLAINED = 1.5
 """Ratio of residual to tracking noise above which a note is given."""
 RATE_TOLERANCE, NOISE_FACTOR = 0.1, 3.0
@@ -175,9 +176,14 @@ def _require_offset(found: GeometryCalibration) -> None:
     offset = next((value for value in found.values if value.name == "time_offset_s"), None)
     if offset is not None and not offset.determined and not offset.rough:
         std = f" (± {1e3 * float(np.max(offset.std)):.1f} ms)" if offset.std is not None else ""
+        if blamed := _blamed(found):
+            raise CalibrationError(
+                f"the time offset is not determined{std}: the points contradict the given {', '.join(blamed)}",
+                hint=f"correct the profile, or pass --with {','.join(blamed)}",
+            )
         raise CalibrationError(
             f"the motion does not determine the time offset{std}",
-            hint="record a few more seconds while rotating the phone about all three axes",
+            hint=MORE_MOTION,
         )
 
 
@@ -237,17 +243,23 @@ def as_json(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNoise |
         "noise_px": found.noise_px,
         "imu": _imu_facts(noise),
         "notes": [*found.notes, *_own_notes(plan, found, noise)],
-        "verdict": _verdict(undetermined, [value.name for value in found.values if value.implausible]),
+        "verdict": _verdict(undetermined, [value.name for value in found.values if value.implausible], _blamed(found)),
         "profile": profile_mapping(found.profile),
     }
 
 
-def _verdict(undetermined: list[str], odd: list[str]) -> str:
+def _blamed(found: GeometryCalibration) -> tuple[str, ...]:
+    """Fixed values that the points contradict, if the residual says that they widen the other standard deviations."""
+    return found.contradicted if found.residual_px > UNEXPLAINED * found.noise_px else ()
+
+
+def _verdict(undetermined: list[str], odd: list[str], blamed: Sequence[str]) -> str:
     """The verdict in one line; odd: the undetermined parameters whose fitted values no camera has."""
     if not undetermined:
         return "calibrated"
     open_yet = [name for name in undetermined if name not in odd]
-    parts = [f"{', '.join(open_yet)} (not determined by this motion)"] if open_yet else []
+    reason = f"with the given {', '.join(blamed)}, which the points contradict" if blamed else "by this motion"
+    parts = [f"{', '.join(open_yet)} (not determined {reason})"] if open_yet else []
     parts += [f"{', '.join(odd)} (implausible value)"] if odd else []
     return f"calibrated, except {' and '.join(parts)}"
 
@@ -282,8 +294,8 @@ def _own_notes(plan: CalibrationPlan, found: GeometryCalibration, noise: ImuNois
             "unexplained, and the standard deviations treat it as noise"
         )
     notes += [
-        f"the time offset is written but known only to ± {1e3 * float(np.max(value.std)):.1f} ms: record a few more "
-        "seconds while rotating the phone about all three axes"
+        f"the time offset is written but known only to ± {1e3 * float(np.max(value.std)):.1f} ms"
+        f"{'' if _blamed(found) else ': ' + MORE_MOTION}"
         for value in found.values
         if value.rough and value.std is not None
     ]

@@ -14,6 +14,7 @@ from virest.effects.changes import keep_readout, rotation_between
 from virest.effects.records import Calibrated
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import right_way_round
+from virest.inference.chance import student_deviation
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.track_fit import TrackFit
 
@@ -98,14 +99,16 @@ def roughly_known(offset: CalibratedValue, fit: TrackFit) -> CalibratedValue:
     return replace(offset, rough=True, note=f"rough: {1e3 * calibrated('time_offset').max_std:g} ms are wanted")
 
 
-def variances_of(fit: TrackFit, bias: dict[str, Array], drift: tuple[float, float]) -> dict[str, Array]:
-    """Variance of each term's values, including residual tracking bias; the time offset refers to the first row.
+def variances_of(fit: TrackFit, bias: dict[str, Array]) -> dict[str, Array]:
+    """Variance of each term's values, with errors common to all points; the time offset refers to the first row.
 
-    bias: standard deviation by term.  drift: (rad, s) as from the accelerometer's noise; it adds to rotation and bias.
+    bias: standard deviation of the tracking bias by term.  Scatter between few time blocks counts as Student's t.
     """
-    found = {term.name: fit.std(term.name) ** 2 + bias[term.name] ** 2 for term in fit.terms}
-    found["imu_rotation"] = found["imu_rotation"] + (0.5 * drift[0]) ** 2
-    found["gyro_bias"] = found["gyro_bias"] + (drift[0] / drift[1]) ** 2
+    found = {}
+    for term in fit.terms:
+        own = fit.slices[term.name]
+        few_blocks = np.array([student_deviation(max(blocks - 1.0, 1.0)) for blocks in fit.stretches[own]])
+        found[term.name] = (few_blocks * fit.std(term.name)) ** 2 + bias[term.name] ** 2 + fit.by_error[own] ** 2
     if "readout_time" in found:
         cross = fit.covariance[fit.slices["time_offset"], fit.slices["readout_time"]][0]
         first_row = found["time_offset"] + 0.25 * found["readout_time"] - cross

@@ -41,15 +41,16 @@ from virest.errors import CalibrationError
 from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
-from virest.inference.blur_bias import blur_bias_px
+from virest.inference.blur_bias import RELATIVE_STD, blur_bias_px
 from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
+from virest.inference.coded_motion import coding_bias_px
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
+from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
-from virest.motion.displacement import drift_std_m
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 log = logging.getLogger(__name__)
@@ -104,19 +105,13 @@ class GeometryCalibration:
     tracks: int
     notes: tuple[str, ...]
     fit: TrackFit
+    contradicted: tuple[str, ...] = ()
+    """Values held fixed that the points contradict, by key of OPTIONAL."""
 
     @property
     def determined(self) -> bool:
         """Whether all values were determined."""
         return all(value.determined for value in self.values)
-
-    @property
-    def verdict(self) -> str:
-        """One-line summary for the user."""
-        open_values = [value.name for value in self.values if not value.determined]
-        if not open_values:
-            return "calibrated"
-        return f"calibrated, except {', '.join(open_values)} (not determined by this motion)"
 
 
 def calibrate_geometry(
@@ -165,7 +160,7 @@ def calibrate_geometry(
     notes = (*found.notes, *held_notes(joint.held, names), *_uneven_note(found.profile, profile))
     if drifts:
         notes = (_drift_note(found, profile.clock_skew), *notes)
-    found = replace(found, notes=notes)
+    found = replace(found, notes=notes, contradicted=tuple(name for name, value in joint.held.items() if value.wrong))
     return found if lag is None else _with_lag(found, lag)
 
 
@@ -371,7 +366,7 @@ class _Joint:
     excluded: float
     """Fraction of the points excluded as moving independently."""
     corrected: bool
-    """Whether the blur bias was removed from the points, so that the fit's change measures what may remain of it."""
+    """Whether the bias of blur and encoder was removed from the points."""
     held: dict[str, HeldValue]
     """Optional values that were not fitted, by key of OPTIONAL."""
 
@@ -381,7 +376,7 @@ def _optional(names: Sequence[str]) -> list[Term]:
 
 
 def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names: Sequence[str]) -> _Joint:
-    """Fit all requested values to many points, without image regions that move independently and without blur bias."""
+    """Fit all requested values to many points, without image regions that move independently and without mean bias."""
     wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS, *_optional(names)]
     excluded = 0.0
     for _ in range(EXCLUSION_PASSES):
@@ -392,9 +387,16 @@ def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names
         if not newly_excluded:
             break
     corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
+    errors_px = []
+    if isinstance(fit.scene, InertialMotion):
+        errors_px.append(path_errors_px(imu, fit.integrated, table, fit.scene))
     if corrected:  # without an accelerometer the blur due to translation is unknown
-        table = replace(table, second_px=table.second_px - blur_bias_px(fit.integrated, table))
-        fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene)
+        blur_px = blur_bias_px(fit.integrated, table, np.array([pair.guided for pair in observed.pairs]))
+        coding_px = coding_bias_px(fit.integrated, table, fit.scene)
+        table = replace(table, second_px=table.second_px - blur_px - coding_px)
+        errors_px.append(RELATIVE_STD * blur_px[None])
+    if errors_px:
+        fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene, errors_px=np.concatenate(errors_px))
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)
     return _Joint(fit, observed, excluded, corrected, held)
@@ -416,10 +418,10 @@ def _conclude(
     noise = float(np.median(observed.noise_px))
     if joint.corrected:
         gyro_rad_s = _gyro_mean_std_rad_s(imu, float(np.ptp(fit.seconds)))
-        bias = {term.name: remaining_std(fit, term.name, fit.value(term.name), gyro_rad_s) for term in fit.terms}
+        bias = {term.name: remaining_std(fit, term.name, gyro_rad_s) for term in fit.terms}
     else:
         bias = {term.name: bias_std(fit, term.name, noise) for term in fit.terms}
-    variances = variances_of(fit, bias, _drift_rad(fit, imu))
+    variances = variances_of(fit, bias)
     if isinstance(fit.scene, DirectedMotion):
         turn_rad, rate_rad_s = _mistaken_rotation(joint, coarse)
         variances["imu_rotation"] = variances["imu_rotation"] + turn_rad**2
@@ -458,15 +460,6 @@ def _conclude(
         tracking_noise_px(observed, fit), residual_px(rough.before), coarse.explained, moving,
         len(observed.pairs), observed.tracks, notes, fit,
     )  # fmt: skip
-
-
-def _drift_rad(fit: TrackFit, imu: ImuSamples) -> tuple[float, float]:
-    """Apparent rotation (rad) due to accelerometer noise over a time window, and the window's length in seconds."""
-    if not isinstance(fit.scene, InertialMotion):
-        return 0.0, 1.0
-    span_s = float(np.ptp(fit.seconds)) / fit.scene.windows
-    inverse_depth_per_m = float(np.median(np.linalg.norm(fit.scene.plane_per_m, axis=-1)))
-    return drift_std_m(imu, span_s) * inverse_depth_per_m, max(span_s, 0.1)
 
 
 def _mistaken_rotation(joint: _Joint, coarse: CoarseAlignment) -> tuple[float, float]:

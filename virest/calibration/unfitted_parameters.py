@@ -48,6 +48,11 @@ class HeldValue:
         return float(np.max(np.abs(self.change) / self.std))
 
     @property
+    def wrong(self) -> bool:
+        """Whether the points contradict the fixed value."""
+        return self.sigma > WRONG_SIGMA
+
+    @property
     def believable(self) -> bool:
         """Whether the change is plausible for a phone."""
         return bool(np.all(np.abs(self.change) <= _CALIBRATED[self.name].believable))
@@ -98,8 +103,14 @@ def held_notes(held: dict[str, HeldValue], fitted: Sequence[str]) -> list[str]:
                 f"{name} depends on {twin.name}, which was held fixed and is determined by this motion to "
                 f"± {twin.std[0]:.1%} only; also rotate the phone about its optical axis"
             )
-    wrong = [value for name, value in held.items() if name not in reported and value.sigma > WRONG_SIGMA]
-    if wrong and all(value.believable for value in wrong):
+    wrong = [value for name, value in held.items() if name not in reported and value.wrong]
+    if [value.name for value in wrong if not value.believable] == ["focal"]:
+        (focal,) = (value for value in wrong if value.name == "focal")
+        notes.append(
+            f"the points contradict intrinsics.fx_px: {focal}; is it for another resolution or zoom? "
+            f"Correct it, or fit with --with {','.join([*fitted, 'focal'])}"
+        )
+    elif wrong and all(value.believable for value in wrong):
         names = ",".join([*fitted, *(value.name for value in wrong)])
         notes.append(
             f"held fixed, and contradicted by the points: {', '.join(map(str, wrong))}; "

@@ -77,6 +77,8 @@ class TrackTable:
     """(windows,) middle of each window, camera clock from stamp_0."""
     noise_px: Array
     """(pairs,) standard deviation of a tracked step per coordinate, measured without a camera model."""
+    bits_per_px: float = np.inf
+    """The movie's, mean; inf: pictures that no encoder has predicted from each other."""
 
     def __len__(self) -> int:
         return len(self.pair)

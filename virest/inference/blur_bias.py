@@ -10,6 +10,9 @@ its slow end, and frequencies near its length respond to that end.  Hand motion 
 steps are too short: by 0.1 % at 5 px of blur and 0.3 % at 9 px, which a fit would absorb in focal length and
 distortion.
 
+A guide blurs the sharper picture by a Gaussian of covariance C before matching, which multiplies K₁* K₂ by
+exp(-fᵀ C f / 2): high frequencies count less, and e is about half as large.
+
 A corner in a window of w px has the power |T|² = 1 / (f² + (2π/w)²)².  Letters, leaves and a board, blurred by hand
 motion, give 0.76 to 1.57 times the predicted e: ``RELATIVE_STD``.
 """
@@ -22,10 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, seen_s
+from virest.inference.guidance import applied_blur
 from virest.inference.tracking import TrackingSettings, shrink_factor
 from virest.motion.trajectory import turned
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 RELATIVE_STD = 0.35
 """Relative standard deviation of e, because textures differ."""
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4
@@ -40,8 +46,11 @@ LEAST_COMMON = 0.5
 POINTS_AT_ONCE = 2000
 
 
-def blur_bias_px(known: IntegratedMotion, table: TrackTable) -> Array:
-    """Tracked minus true second points (n, 2), px, from the camera's rotation during both exposures."""
+def blur_bias_px(known: IntegratedMotion, table: TrackTable, guided: Mask) -> Array:
+    """Tracked minus true second points (n, 2), px, from the camera's rotation during both exposures.
+
+    guided: (pairs,) whether a guide made the pair's pictures equally blurred.
+    """
     profile = known.profile
     factor = shrink_factor(profile.width, profile.height)
     paths = []
@@ -52,22 +61,27 @@ def blur_bias_px(known: IntegratedMotion, table: TrackTable) -> Array:
         time_s = seen_s(profile, points_px, stamp_s, exposure_s)
         half_s = 0.5 * np.asarray(profile.shutter.true_exposure_s(exposure_s))
         paths.append(_path(known, points_px, time_s, half_s) / factor)
+    added = _added_blur(paths[0][0], paths[1][0], table.pair, guided)
     found = np.zeros((len(table), 2))
     blurred = np.flatnonzero(
         np.linalg.norm(paths[0][0], axis=-1) + np.linalg.norm(paths[1][0], axis=-1) > LEAST_BLUR_PX
     )
     for part in np.array_split(blurred, max(len(blurred) // POINTS_AT_ONCE, 1)):
-        found[part] = factor * matched_shift_px(*((speed[part], bend[part]) for speed, bend in paths))
+        first, second = ((speed[part], bend[part]) for speed, bend in paths)
+        found[part] = factor * matched_shift_px(first, second, added[part])
     return found
 
 
-def matched_shift_px(first: tuple[Any, Any], second: tuple[Any, Any]) -> Array:
+def matched_shift_px(first: tuple[Any, Any], second: tuple[Any, Any], added: Array | None = None) -> Array:
     """Shift e (n, 2), px, between features with the blur paths p(u) = speed u + bend u², u from -1 to 1.
 
-    first, second: speed (n, 2) and bend (n, 2) of both exposures, px.
+    first, second: speed (n, 2) and bend (n, 2) of both exposures, px.  added (n, 2, 2): covariance of the Gaussian blur
+    added to either picture before matching, px².
     """
     f, power = _corner_spectrum()
     both = np.conj(_transfer(*first, f)) * _transfer(*second, f)
+    if added is not None:
+        both = both * np.exp(-0.5 * np.einsum("ki,nij,kj->nk", f, added, f))
     pull = (power * both.imag) @ f
     stiffness, firm = (np.einsum("nk,ki,kj->nij", power * real, f, f) for real in (both.real, np.abs(both.real)))
     loose = np.trace(stiffness, axis1=1, axis2=2) < LEAST_COMMON * np.trace(firm, axis1=1, axis2=2)
@@ -75,6 +89,17 @@ def matched_shift_px(first: tuple[Any, Any], second: tuple[Any, Any]) -> Array:
     found = -np.linalg.solve(stiffness, pull[..., None])[..., 0]
     length = np.linalg.norm(found, axis=-1, keepdims=True)
     return np.asarray(found * np.minimum(1.0, MOST_SHIFT_PX / np.maximum(length, MOST_SHIFT_PX)))
+
+
+def _added_blur(first_speed: Array, second_speed: Array, pair: Index, guided: Mask) -> Array:
+    """Covariances (n, 2, 2), px², of the blur that a guide adds to the pictures of each point's pair."""
+    count = np.maximum(np.bincount(pair, minlength=len(guided)), 1)[:, None]
+    first, second = (
+        np.stack([np.bincount(pair, column, len(guided)) for column in products.T], axis=-1) / count
+        for products in ((v[:, :, None] * v[:, None, :] / 3).reshape(-1, 4) for v in (first_speed, second_speed))
+    )
+    added = applied_blur((second - first).reshape(-1, 2, 2)) + applied_blur((first - second).reshape(-1, 2, 2))
+    return np.asarray(added * guided[:, None, None])[pair]
 
 
 def _path(known: IntegratedMotion, points_px: Array, time_s: Array, half_s: Array) -> Array:

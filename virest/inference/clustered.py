@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 RELATIVE_FLOOR = 1e-9
+ABSORBED_FLOOR = 1e-12
+LEAST_LEFT = 0.05
+"""Smallest part of a group's scatter that a fit leaves; a value with less comes from one group alone."""
 
 
 def scatter(pull: Array, group: Index, *, about_mean: bool = False) -> Array:
@@ -27,6 +30,26 @@ def scatter(pull: Array, group: Index, *, about_mean: bool = False) -> Array:
     if about_mean:
         sums -= sums.mean(axis=0)
     return np.asarray(sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
+
+
+def adjusted_sums(pull: Array, normal: Array, group: Index) -> Array:
+    """Sums (groups, k) of scores ``pull`` (n, k) by group, corrected for what the fit has absorbed of each group.
+
+    normal (groups, k, k): each group's part of the curvature, whose sum the priors may exceed.  A group that determines
+    a value nearly alone leaves no residual of it.  The correction (I − H⁻½ H_g H⁻½)^−½ makes the scatter unbiased for
+    independent residuals (Bell & McCaffrey 2002, "CR2").
+    """
+    sums = np.stack([np.bincount(group, column, len(normal)) for column in pull.T], axis=-1)
+    sums -= sums.mean(axis=0)
+    total = normal.sum(axis=0)
+    size = np.sqrt(np.maximum(np.diag(total), 1e-300))
+    values, axes = np.linalg.eigh(total / np.outer(size, size))
+    known = values > ABSORBED_FLOOR * values[-1]
+    down = axes[:, known] / np.sqrt(values[known]) / size[:, None]
+    up = axes[:, known] * np.sqrt(values[known]) * size[:, None]
+    left, ways = np.linalg.eigh(np.eye(known.sum()) - down.T @ normal @ down)
+    scaled = np.einsum("gji,gj->gi", ways, sums @ down) / np.sqrt(np.maximum(left, LEAST_LEFT))
+    return np.asarray(np.einsum("gij,gj->gi", ways, scaled) @ up.T)
 
 
 def raised(covariance: Array, least: Array) -> Array:

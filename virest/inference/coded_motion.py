@@ -1,14 +1,18 @@
-"""The bias of tracked points from block motion prediction: points are pulled towards their upper and left neighbours.
+"""The bias of tracked points from block motion prediction: points are pulled towards the motion of their neighbours.
 
 An encoder predicts a block's motion from blocks coded before it, mainly above, and spends bits on another motion only
 where that pays.  Differences of a fraction of a pixel do not pay: a point then moves like the picture slightly above
 it.  With a readout from top to bottom, that is the motion at an earlier time, so points seem to lag; from bottom to top
 they seem to lead.  In equally coded captures of the same motion, read down, up, right and left, offsets were off by
-−88, +88, −15 and +23 µs (photographs at 0.1 bit per pixel), and by less than 4 µs when hardly compressed.
+−88, +88, −15 and +23 µs (photographs at 0.1 bit per pixel), and by less than 4 µs when hardly compressed.  For the same
+reason the flow is flattened: yaw and pitch move the border of a picture further than its centre, and the coded picture
+less so, as with a smaller k1.
 
-The residual error in the decoded picture grows with the detail that the encoder drops.  Its length depends little on
-the speed of the motion: a block keeps its predicted motion until that is wrong by a certain length.  Differences that
-stay in the picture from frame to frame, such as those of a roll, are followed better than those of rows' times.
+The residual error in the decoded picture decreases with the square root of the bit rate: at low rates the squared error
+of transform coding is inverse to the rate (Mallat & Falzon 1998, doi:10.1109/78.668554).  Detail converts it to a
+length as it does the noise of a step, so the bias is a fraction of that noise.  It depends little on the speed of the
+motion: a block keeps its predicted motion until that is wrong by a certain length.  Differences that stay in the
+picture from frame to frame, such as those of a roll, are followed better than those of rows' times.
 """
 
 from __future__ import annotations
@@ -23,33 +27,41 @@ from virest.image_formation.row_clock import RowClock
 from virest.motion.scene_motion import Motion
 
 Array = NDArray[np.float64]
-AT_ONCE_PER_PX, BY_ROWS_PER_PX = (0.5, 1.0), (1.2, 2.3)
-"""Usual error of a step from the blocks to the left and above, over the square of the step's noise, both in px: where
-steps differ at one instant, and where they differ because rows are read at other times.
-``python -m virest.app.bench --only coding`` prints both; at one instant as at 0.1 bits per pixel, where the points' own
-noise matters least."""
-MOST_ERROR_PX = 0.06
-"""Largest error found, at 0.16 px of noise; noise above that has other causes than the encoder."""
+BITS_PER_PX = 0.1
+"""Bit rate of the fractions below."""
+MEAN = np.array([0.035, 0.08, 0.04, 0.20, 0.03])
+DEVIATION = np.array([0.035, 0.03, 0.07, 0.12, 0.03])
+"""Bias of a step as a fraction of its noise: mean, and standard deviation between captures.  Towards the blocks to the
+left and above, where steps differ at one instant; the same where they differ because columns or rows are read at other
+times; and from the curved part of the flow to its affine part.  ``python -m virest.app.bench --only coding`` prints
+them for its captures.  The last is from 12 captures of two simulators at up to 0.6 bits per pixel."""
+USUAL = np.hypot(MEAN, DEVIATION)
+"""Root mean square of the fractions."""
+MOST_NOISE_PX = 0.16
+"""Largest noise at which the encoder's errors were measured; noise above that has other causes, mostly blur."""
 BLOCK_PX = 16.0
 """Side of a block: the largest distance over which motion is predicted."""
 LEAST_SLOPE = 1e-4
 """Steps that change less than this per pixel have no bias."""
 MOST_SLOPE = 1.0
 """Largest change of a step per pixel; larger values belong to points where the lens model folds back."""
+LEAST_CURVED_PX = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class StepSlopes:
-    """Predicted change of n points' steps per pixel."""
+    """Predicted differences between n points' steps: per pixel, and from an affine flow."""
 
     at_once: Array
-    """(2, n, 2) to the right and down, as if all rows were exposed at the same time."""
+    """(2, n, 2) per pixel to the right and down, as if all rows were exposed at the same time."""
     by_rows: Array
     """(2, n, 2) what the rows' own times add."""
+    curved_px: Array
+    """(n, 2) the steps less the best affine flow of their pair."""
 
 
 def step_slopes(known: IntegratedMotion, table: TrackTable, scene: Motion | None, at: Prediction) -> StepSlopes:
-    """Predicted change of points' steps per pixel."""
+    """Predicted differences between points' steps."""
     seen_s, sights = RowClock(known.profile).seen_s, ("first", "second")
 
     def slope(beside: TrackTable, way: Array) -> Array:
@@ -67,19 +79,38 @@ def step_slopes(known: IntegratedMotion, table: TrackTable, scene: Motion | None
             continue
         stamps = [stamp - later for (stamp, _), later in zip(times, later_s, strict=True)]
         at_once.append(slope(replace(beside, first_stamp_s=stamps[0], second_stamp_s=stamps[1]), way))
-    return StepSlopes(np.array(at_once), np.array(whole) - np.array(at_once))
+    curved_px = _beyond_affine(table.first_px, at.second_px - table.first_px, table.pair)
+    return StepSlopes(np.array(at_once), np.array(whole) - np.array(at_once), curved_px)
 
 
-def drawn_px(slopes: StepSlopes, noise_px: Array) -> Array:
-    """Errors (4, n, 2) of steps, one standard deviation each: left and above at one instant, then by rows' times.
+def _beyond_affine(points_px: Array, steps_px: Array, pair: NDArray[np.intp]) -> Array:
+    """Steps (n, 2) less the affine flow that fits those of their pair best."""
+    basis = np.concatenate([np.ones((len(pair), 1)), points_px - points_px.mean(axis=0)], axis=-1)
+    basis /= np.maximum(np.abs(basis).max(axis=0, initial=0.0), 1e-9)
+    products = basis[:, :, None] * np.concatenate([basis, steps_px], axis=-1)[:, None, :]
+    sums = np.stack([np.bincount(pair, column) for column in products.reshape(len(pair), -1).T], axis=-1)
+    sums = sums.reshape(-1, 3, 5)
+    flow = np.linalg.pinv(sums[..., :3], rcond=1e-9, hermitian=True) @ sums[..., 3:]
+    return np.asarray(steps_px - np.squeeze(basis[:, None, :] @ flow[pair], 1))
 
-    noise_px: (n,) of a step.
-    """
-    usual = np.sqrt(np.mean(((slopes.at_once + slopes.by_rows) ** 2).sum(axis=-1), axis=-1))[:, None]
 
-    def drawn(of: Array, per_px: tuple[float, float]) -> Array:
-        error_px = np.minimum(np.array(per_px)[:, None] * noise_px**2, MOST_ERROR_PX)
-        away_px = np.minimum(error_px / np.maximum(usual, LEAST_SLOPE), BLOCK_PX)
-        return np.asarray(-away_px[..., None] * of)
+def drawn_px(slopes: StepSlopes, noise_px: Array, bits_per_px: float) -> Array:
+    """Errors (5, n, 2) of steps, of the usual size each, in the order of MEAN.  noise_px: (n,) of a step."""
+    error_px = USUAL[:, None] * np.minimum(noise_px, MOST_NOISE_PX) * np.sqrt(BITS_PER_PX / bits_per_px)
+    steepness = _rms(slopes.at_once + slopes.by_rows)[:, None]
+    away_px = np.minimum(error_px[:4].reshape(2, 2, -1) / np.maximum(steepness, LEAST_SLOPE), BLOCK_PX)
+    pulled = -away_px[..., None] * np.stack([slopes.at_once, slopes.by_rows])
+    flattened = np.minimum(error_px[4] / np.maximum(_rms(slopes.curved_px), LEAST_CURVED_PX), 1.0)
+    return np.concatenate([pulled.reshape(4, -1, 2), -(flattened[:, None] * slopes.curved_px)[None]])
 
-    return np.concatenate([drawn(slopes.at_once, AT_ONCE_PER_PX), drawn(slopes.by_rows, BY_ROWS_PER_PX)])
+
+def coding_bias_px(known: IntegratedMotion, table: TrackTable, scene: Motion | None) -> Array:
+    """Mean error (n, 2) of the tracked second points from the encoder's motion prediction."""
+    slopes = step_slopes(known, table, scene, predict(known, table, scene))
+    drawn = drawn_px(slopes, table.noise_px[table.pair], table.bits_per_px)
+    return np.asarray(np.tensordot(MEAN / USUAL, drawn, axes=1))
+
+
+def _rms(vectors: Array) -> Array:
+    """Root mean square (...) of the lengths of vectors (..., n, 2)."""
+    return np.asarray(np.sqrt(np.mean((vectors**2).sum(axis=-1), axis=-1)))

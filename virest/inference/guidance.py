@@ -165,7 +165,13 @@ def _nodes_px(shape: tuple[int, int], factor: int) -> Array:
 
 def _positive_part(covariance: Array) -> Array:
     values, axes = np.linalg.eigh(covariance)
-    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)
+    return np.asarray((axes * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(axes, -1, -2))
+
+
+def applied_blur(difference: Array) -> Array:
+    """Covariances (..., 2, 2) of the Gaussians by which pictures are blurred that lack these covariances, px²."""
+    lacking = np.linalg.eigvalsh(difference)[..., -1] >= LEAST_BLUR_PX**2
+    return np.where(lacking[..., None, None], _positive_part(difference), 0.0)
 
 
 def _blurred(picture: Picture, covariance: Array | None) -> Picture:

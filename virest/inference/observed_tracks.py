@@ -44,6 +44,8 @@ class ObservedTracks:
     """(pairs,) standard deviation of a step per coordinate."""
     lens: Intrinsics
     """The profile's, or a guess."""
+    bits_per_px: float = np.inf
+    """The movie's, mean; inf: pictures that were not encoded as a movie."""
 
     @property
     def tracks(self) -> int:
@@ -115,7 +117,8 @@ class ObservedTracks:
         """All points in one table, evenly thinned to about max_points."""
         stride = max(-(-self.tracks // max_points), 1)
         pairs = [_thinned(pair, k % stride, stride) for k, pair in enumerate(self.pairs)]
-        return track_table(pairs, self.stamp_s, self.exposure_s, self.noise_px, self._windows())
+        table = track_table(pairs, self.stamp_s, self.exposure_s, self.noise_px, self._windows())
+        return replace(table, bits_per_px=self.bits_per_px)
 
     def _windows(self) -> list[list[int]]:
         """Equal windows of at most WINDOW_S; a gap of half of it also ends a window."""
@@ -135,7 +138,7 @@ def observe_tracks(capture: Capture, pairs: Sequence[TrackPair], profile: Camera
         pair for pair in pairs if len(pair) >= MIN_TRACKS and np.isfinite(stamp_s[[pair.first, pair.second]]).all()
     )
     lens = profile.intrinsics or guessed_lens(profile)
-    return ObservedTracks(kept, stamp_s, exposure_s, known, step_noise_px(kept), lens)
+    return ObservedTracks(kept, stamp_s, exposure_s, known, step_noise_px(kept), lens, capture.bits_per_px)
 
 
 def frame_times(capture: Capture) -> tuple[Array, Array, bool]:

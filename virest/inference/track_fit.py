@@ -18,9 +18,10 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, with_profile
-from virest.inference.clustered import CovarianceModel, Index, scatter
-from virest.inference.coded_motion import drawn_px, step_slopes
+from virest.inference.clustered import CovarianceModel, Index, adjusted_sums, scatter
+from virest.inference.coded_motion import DEVIATION, USUAL, drawn_px, step_slopes
 from virest.inference.descent import MAX_ITERATIONS, descend, slices
+from virest.inference.profile_curvature import at_profile_minimum
 from virest.inference.robust import CAUCHY
 from virest.inference.term import Term
 from virest.inference.time_blocks import even_blocks
@@ -90,8 +91,11 @@ class TrackFit:
     """(n,) noise of each point's step, per coordinate."""
     along_px: Array | None
     """(n, 2) change of the second points per unit of inverse depth; None if no relief is modelled."""
-    by_coding: Array
-    """(k + scene,) errors of the values from block motion prediction (`coded_motion`); 0 without covariances."""
+    by_coding_pattern: Array
+    """(k + scene, patterns) errors of the values from block motion prediction of the usual size (`coded_motion`); 0
+    without covariances."""
+    by_error: Array
+    """(k + scene,) standard deviation of the values due to the points' errors passed to :func:`fit_tracks`."""
     slices: dict[str, slice] = field(default_factory=dict)
 
     def distance_at(self, depth_spread_per_m: float) -> Array:
@@ -121,6 +125,16 @@ class TrackFit:
             return np.zeros(len(self.distance))
         ratio = np.linalg.norm(self.along_px, axis=-1) / self.noise_px
         return np.asarray(0.5 * np.log1p((self.depth_spread_per_m * ratio) ** 2))
+
+    @property
+    def by_coding(self) -> Array:
+        """Standard deviations (k + scene,) of values from points as tracked, because of block motion prediction."""
+        return np.asarray(np.linalg.norm(self.by_coding_pattern, axis=-1))
+
+    @property
+    def by_coding_left(self) -> Array:
+        """The same for points without the mean error."""
+        return np.asarray(np.linalg.norm(self.by_coding_pattern * (DEVIATION / USUAL), axis=-1))
 
     @property
     def curvature(self) -> Array:
@@ -169,10 +183,12 @@ def fit_tracks(
     blocks: int = 12,
     max_iterations: int = MAX_ITERATIONS,
     covariances: bool = True,
+    errors_px: Array | None = None,
 ) -> TrackFit:
     """Gauss-Newton from a profile; scene None: rotation only. Raises ImuError for too few inertial samples.
 
     covariances: False skips re-evaluating the final slopes: values and residuals are the same, covariances are coarse.
+    errors_px (m, n, 2): errors common to all points, independent of each other, of one standard deviation each.
     """
     terms = tuple(terms)
     inertial = isinstance(scene, InertialMotion)
@@ -191,21 +207,33 @@ def fit_tracks(
         if not inertial or abs(spread - state.depth_spread) <= SPREAD_TOLERANCE * spread:
             break
         state = replace(system.state, depth_spread=spread)
-    by_coding = _by_coding(evidence, system) if covariances else np.zeros(len(system.prior))
-    return _conclude(table, terms, system, spread, blocks, by_coding)
+    inverse, bend = system.inverse(), 1.0
+    if covariances and directed and inverse.size:
+        system, inverse = at_profile_minimum(evidence, system)
+    else:
+        bend = _true_curvature(system)
+    coded = np.zeros((len(USUAL), 0, 2))
+    if covariances and inverse.size:
+        at = system.look.prediction
+        slopes = step_slopes(system.state.known, table, system.state.scene, at)
+        coded = drawn_px(slopes, table.noise_px[table.pair], table.bits_per_px)
+    moved = [_moved_by(evidence, system, inverse, errors) for errors in (coded, errors_px)]
+    return _conclude(table, terms, system, inverse, bend, spread, blocks, (moved[0], np.linalg.norm(moved[1], axis=-1)))
 
 
 def _conclude(
     table: TrackTable,
     terms: tuple[Term, ...],
     system: TrackSystem,
+    inverse: Array,
+    bend: float,
     depth_spread: float,
     blocks: int,
-    by_coding: Array,
+    moved_by: tuple[Array, Array],
 ) -> TrackFit:
-    inverse, state, prediction = system.inverse(), system.state, system.look.prediction
+    state, prediction = system.state, system.look.prediction
     relief = _relief(table, system, inverse, depth_spread)
-    model = replace(_covariance_model(table, system, inverse, blocks), relief=relief)
+    model = replace(_covariance_model(table, system, inverse, bend, blocks), relief=relief)
     stretches = _stretches(table, system, inverse, blocks)[: len(state.change)]
     noise_px, directed = table.noise_px[table.pair], isinstance(state.scene, DirectedMotion)
     difference = system.left * noise_px[:, None] if directed else table.second_px - prediction.second_px
@@ -215,14 +243,16 @@ def _conclude(
         float(system.scale), depth_spread,
         difference, system.weight, np.sqrt(system.squared), stretches,
         system.cost(1.0), state.known, prediction.second_s, noise_px,
-        None if directed else prediction.along_px, by_coding, dict(parts),
+        None if directed else prediction.along_px, *moved_by, dict(parts),
     )  # fmt: skip
 
 
 # ── covariance ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _covariance_model(table: TrackTable, system: TrackSystem, inverse: Array, blocks: int) -> CovarianceModel:
+def _covariance_model(
+    table: TrackTable, system: TrackSystem, inverse: Array, bend: float, blocks: int
+) -> CovarianceModel:
     """Scatter of the points' scores by time blocks and by image regions.
 
     Points of one time block share errors, and points of one image region share relief while the camera keeps moving in
@@ -232,22 +262,26 @@ def _covariance_model(table: TrackTable, system: TrackSystem, inverse: Array, bl
     if count < MIN_BLOCKS or not inverse.size:
         return CovarianceModel(inverse)
     block = even_blocks(table.pair, table.n_pairs, count)
-    moved = system.score @ inverse / _true_curvature(system)
+    moved = system.score @ inverse / bend
     region = _regions(table.first_px)
     by_region = scatter(moved, region, about_mean=True) - scatter(moved, block * REGIONS**2 + region, about_mean=True)
-    return CovarianceModel(
-        inverse, scatter(moved, block, about_mean=True), by_region, inverse @ (system.prior[:, None] * inverse)
-    )
+    sums = adjusted_sums(system.score, _normal_by_block(system, block, count), block) @ inverse / bend
+    return CovarianceModel(inverse, sums.T @ sums, by_region, inverse @ (system.prior[:, None] * inverse))
 
 
-def _by_coding(evidence: TrackEvidence, system: TrackSystem) -> Array:
-    """Errors of the values (k,) from steps biased towards the left and upper neighbours, combined."""
-    table, state, at = evidence.table, system.state, system.look.prediction
-    if not system.prior.size:
-        return np.zeros(0)
-    drawn = drawn_px(step_slopes(state.known, table, state.scene, at), table.noise_px[table.pair])
-    pulled = system.pull(evidence.whitened(state, at, np.moveaxis(drawn, 0, -1)))
-    return np.asarray(np.linalg.norm(system.inverse() @ pulled, axis=-1))
+def _normal_by_block(system: TrackSystem, block: Index, blocks: int) -> Array:
+    """Each block's part (blocks, k, k) of the curvature."""
+    rows = system.rows * np.sqrt(system.weight / np.square(system.scale))[:, None, None]
+    parts = (rows[block == number].reshape(-1, rows.shape[-1]) for number in range(blocks))
+    return np.stack([part.T @ part for part in parts])
+
+
+def _moved_by(evidence: TrackEvidence, system: TrackSystem, inverse: Array, errors_px: Array | None) -> Array:
+    """Changes (k, m) of the values by errors (m, n, 2) of the points; 0 for errors of no points."""
+    if errors_px is None or not errors_px.shape[1]:
+        return np.zeros((len(system.prior), 0 if errors_px is None else len(errors_px)))
+    errors = evidence.whitened(system.state, system.look.prediction, np.moveaxis(errors_px, 0, -1))
+    return np.asarray(inverse @ system.pull(errors))
 
 
 def _relief(table: TrackTable, system: TrackSystem, inverse: Array, depth_spread: float) -> Array | None:
@@ -274,8 +308,7 @@ def _regions(points_px: Array) -> Index:
 
 def _true_curvature(system: TrackSystem) -> float:
     """Curvature of the Cauchy loss over that of its weights, which the normal equations use instead."""
-    ways = 2 if isinstance(system.state.scene, DirectedMotion) else 1
-    bent = ways * system.weight**2 * system.squared / (CAUCHY * system.scale) ** 2
+    bent = system.weight**2 * system.squared / (CAUCHY * system.scale) ** 2
     return max(float((system.weight - bent).sum() / max(system.weight.sum(), 1e-12)), 0.3)
 
 

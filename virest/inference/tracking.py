@@ -91,6 +91,8 @@ class TrackPair:
     """(n, 2), the same points."""
     forward_backward_px: Array | None = None
     """(n,) distance between a point and its position after tracking forwards and back."""
+    guided: bool = False
+    """Whether a guide warped the first picture and made both pictures equally blurred before matching."""
 
     def __len__(self) -> int:
         return len(self.points_first_px)
@@ -232,7 +234,8 @@ def _track(
     else:
         ahead, good, distance = _guided(first, second, start, settings, between)
     returned_px = distance[good].astype(float) * factor
-    return TrackPair(index, index + 1, _stored(start[good], factor), _stored(ahead[good], factor), returned_px)
+    points_px = _stored(start[good], factor), _stored(ahead[good], factor)
+    return TrackPair(index, index + 1, *points_px, returned_px, guided=between is not None)
 
 
 def _guided(

@@ -17,7 +17,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.inference.blur_bias import RELATIVE_STD
 from virest.inference.track_fit import TrackFit
 
 Array = NDArray[np.float64]
@@ -78,33 +77,23 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
 
 # ── points without the bias of their blur ────────────────────────────────────────────────────────────────────────
 
-STILL_SHARED = {
-    "time_offset": 0.010,
-    "readout_time": 0.022,
-    "imu_rotation": 0.006,
-    "gyro_bias": 0.005,
-    "focal_length": 0.014,
-    "radial_distortion": 0.012,
-    "principal_point": 0.006,
-    "exposure_time": 0.005,
-}
-"""Fraction of a step's noise that is correlated with a value's own pattern after the blur bias is removed.  The rest
-comes mostly from the codec, whose predicted blocks shear less than rows do.  Values of 52 captures drawn like those of
-``python -m virest.app.bench --only calibration``; that command prints the values for its captures."""
-STILL_SHARED_OTHER = 0.012
-"""The same for all other values: a typical one."""
+STILL_SHARED = {"readout_time": 0.014, "focal_length": 0.026, "principal_point": 0.014}
+STILL_SHARED_OTHER = 0.008
+"""Fraction of a step's noise that is correlated with a value's own pattern after the mean bias of blur and encoder is
+removed: for three values, and for any other.  The most likely fractions in 81 captures, a quarter each of them quiet,
+fast, coded at about 0.1 bits per pixel, and drawn like those of ``python -m virest.app.bench --only
+calibration``; that command prints the values for its captures."""
 GYRO_WANDER_RAD_S = 5e-5
 """Bias instability of phones' gyroscopes: 10 degrees an hour (data sheets of BMI160, LSM6DSO, ICM-20602: 3 to 10)."""
 
 
-def remaining_std(fit: TrackFit, name: str, moved: Array, gyro_mean_std_rad_s: float) -> Array:
-    """Standard deviation (k,) of a term's remaining bias, from points without the blur bias.
+def remaining_std(fit: TrackFit, name: str, gyro_mean_std_rad_s: float) -> Array:
+    """Standard deviation (k,) of a term's remaining bias, from points without the mean bias of blur and encoder.
 
-    moved (k,): change of the values by that correction.  gyro_mean_std_rad_s: standard deviation of the mean gyroscope
-    noise over the capture.
+    gyro_mean_std_rad_s: standard deviation of the mean gyroscope noise over the capture.
     """
     own = fit.slices[name]
-    std = np.hypot(np.hypot(shared_std(fit, name), RELATIVE_STD * moved), fit.by_coding[own])
+    std = np.hypot(shared_std(fit, name), fit.by_coding_left[own])
     if name == "gyro_bias":
         wander = np.hypot(GYRO_WANDER_RAD_S, gyro_mean_std_rad_s)
         return np.asarray(np.hypot(np.hypot(std, wander), SHARED_RELIEF * fit.by_relief[own]))

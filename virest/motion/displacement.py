@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from virest.camera.kalibr import DIFFERENCE_GAIN, DIFFERENCE_ORDER
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.trajectory import Trajectory
@@ -68,18 +67,6 @@ def _parts(values: Array) -> tuple[Array, Array, Array]:
     """The spline's values (..., 15) as position (..., 3), bias (..., 3, 3) and delay (..., 3) parts."""
     rows = values.reshape(*values.shape[:-1], 3, 5)
     return rows[..., 0], rows[..., 1:4], rows[..., 4]
-
-
-def drift_std_m(imu: ImuSamples, span_s: float) -> float:
-    """Standard deviation of the displacement after span_s from the accelerometer's white noise alone.
-
-    σ √Δt T^1.5 / √3; σ from fifth differences, which suppress hand motion.  Inf without an accelerometer.
-    """
-    force = imu.accel_m_s2[np.isfinite(imu.accel_m_s2).all(axis=1)]
-    if len(force) < 12:
-        return float("inf")
-    noise = float(np.median(np.std(np.diff(force, n=DIFFERENCE_ORDER, axis=0), axis=0))) / DIFFERENCE_GAIN**0.5
-    return noise * float(np.sqrt(np.median(np.diff(imu.time_s)) / 3)) * span_s**1.5
 
 
 def force_at_samples(imu: ImuSamples) -> tuple[Array, Array] | None:

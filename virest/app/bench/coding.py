@@ -3,12 +3,13 @@
 $ python -m virest.app.bench --only coding --quick
 
 Captures without model errors, of four scenes and motions, are read out in all four directions and coded at three bit
-rates.  The time offset and the principal point are each fitted alone.  Their errors imply a coding error of a step,
-divided by the square of its noise: by rows, and at one instant.
+rates.  Time offset, principal point, and k1 with the focal length are each fitted alone.  Their errors imply a coding
+error of a step, as a fraction of its noise at 0.1 bits per pixel: by rows, at one instant, and of curved flow.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -23,10 +24,11 @@ from virest.app.diagnose import open_source
 from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.capture.video import GrayReader
 from virest.image_formation.point_model import TrackTable, integrate_motion, predict
-from virest.inference.coded_motion import AT_ONCE_PER_PX, BY_ROWS_PER_PX, drawn_px, step_slopes
+from virest.inference.blur_bias import blur_bias_px
+from virest.inference.coded_motion import DEVIATION, MEAN, USUAL, drawn_px, step_slopes
 from virest.inference.guide_choice import track_guided
 from virest.inference.observed_tracks import observe_tracks
-from virest.inference.profile_terms import PRINCIPAL_POINT, TIME_OFFSET
+from virest.inference.profile_terms import FOCAL, K1, PRINCIPAL_POINT, TIME_OFFSET
 from virest.inference.term import Term
 from virest.inference.track_fit import fit_tracks
 
@@ -58,50 +60,58 @@ def _row(work: Path, scene: tuple[int, str], read: str, bits_per_px: float) -> R
     source = open_source(folder)
     capture, profile = source.capture, source.profile
     pairs = track_guided(capture, profile, GrayReader.of(capture.movie), range(FRAMES))
-    seen = observe_tracks(capture, pairs, profile).table(MOST_POINTS)
+    observed = observe_tracks(capture, pairs, profile)
+    seen = observed.table(MOST_POINTS)
 
-    def fitted(term: Term, points: TrackTable) -> Array:
-        return fit_tracks(capture.imu, points, profile, (term,), covariances=False).change
+    def fitted(terms: Sequence[Term], points: TrackTable) -> Array:
+        return fit_tracks(capture.imu, points, profile, terms, covariances=False).change
 
     known = integrate_motion(capture.imu, profile, translation=False)
+    guided = np.array([pair.guided for pair in observed.pairs])
+    seen = replace(seen, second_px=seen.second_px - blur_bias_px(known, seen, guided))
     slopes = step_slopes(known, seen, None, predict(known, seen, None))
-    at_once, by_rows = np.split(drawn_px(slopes, seen.noise_px[seen.pair]), 2)
-    axis = 0 if profile.shutter.reads_columns else 1
-    offset_s, centre_px = fitted(TIME_OFFSET, seen), fitted(PRINCIPAL_POINT, seen)
+    drawn = drawn_px(slopes, seen.noise_px[seen.pair], seen.bits_per_px)
+    rows, lens = 2 if profile.shutter.reads_columns else 3, (FOCAL, K1)
+    offset, centre = (TIME_OFFSET,), (PRINCIPAL_POINT,)
+    off: dict[tuple[Term, ...], Array] = {terms: fitted(terms, seen) for terms in (offset, centre, lens)}
 
-    def asked(term: Term, off: Array, drawn: Array, in_use: float, part: int = 0) -> float:
-        unit = fitted(term, replace(seen, second_px=seen.second_px + drawn / in_use)) - off
-        return float(off[part] / unit[part])
+    def asked(terms: tuple[Term, ...], pattern: int, part: int) -> float:
+        usual = fitted(terms, replace(seen, second_px=seen.second_px + drawn[pattern])) - off[terms]
+        return float(USUAL[pattern] * off[terms][part] / usual[part])
 
-    left, above = (asked(PRINCIPAL_POINT, centre_px, at_once[k], AT_ONCE_PER_PX[k], k) for k in (0, 1))
     return {"scene": name, "read": read, "bits_per_px": bits_per_px, "noise_px": float(np.median(seen.noise_px)),
-            "offset_s": float(offset_s[0]), "centre_px": centre_px.tolist(), "left": left, "above": above,
-            "by_rows": asked(TIME_OFFSET, offset_s, by_rows[axis], BY_ROWS_PER_PX[axis])}  # fmt: skip
+            "offset_s": float(off[offset][0]), "centre_px": off[centre].tolist(), "k1": float(off[lens][1]),
+            "left": asked(centre, 0, 0), "above": asked(centre, 1, 1), "by_rows": asked(offset, rows, 0),
+            "curved": asked(lens, 4, 1)}  # fmt: skip
 
 
 def _text(rows: list[Row]) -> str:
     lines = []
     for read, bits in product(READOUT_DIRECTIONS, BITS_PER_PX):
         some = [row for row in rows if row["read"] == read and row["bits_per_px"] == bits]
-        off = 1e6 * np.mean([row["offset_s"] for row in some]), *np.mean([row["centre_px"] for row in some], axis=0)
+        offset_us, k1 = (scale * np.mean([row[key] for row in some]) for scale, key in ((1e6, "offset_s"), (1.0, "k1")))
+        off = offset_us, *np.mean([row["centre_px"] for row in some], axis=0), k1
         lines.append(
             [read, f"{bits:g}", f"{np.mean([row['noise_px'] for row in some]):.3f}",
-             *(f"{value:+.{digits}f}" for value, digits in zip(off, (0, 2, 2), strict=True)),
-             *(_asked(some, kind) for kind in ("by_rows", "left", "above"))]
+             *(f"{value:+.{digits}f}" for value, digits in zip(off, (0, 2, 2, 4), strict=True)),
+             *(_asked(some, kind) for kind in ("by_rows", "left", "above", "curved"))]
         )  # fmt: skip
-    header = ["read", "bits/px", "noise px", "offset µs", "cx px", "cy px",
-              "by rows: implied 1/px, rms", "at once, left", "at once, above"]  # fmt: skip
-    lines.append(["all", "", "", "", "", "", "", _asked(rows, "left"), _asked(rows, "above")])
-    for name, read in (("columns", "left_to_right right_to_left"), ("rows", "top_to_bottom bottom_to_top")):
-        lines.append(
-            [name, "", "", "", "", "", _asked([row for row in rows if row["read"] in read], "by_rows"), "", ""]
-        )
-    in_use = f"in use: by rows {BY_ROWS_PER_PX}, at once {AT_ONCE_PER_PX} (left, above)"
-    title = f"CODING: points pulled to the motion of the blocks above and to the left; {in_use}\n"
-    return title + numeric_table(header, lines)
+    header = ["read", "bits/px", "noise px", "offset µs", "cx px", "cy px", "k1",
+              "by rows: implied mean ± std", "left", "above", "curved"]  # fmt: skip
+    for bits in BITS_PER_PX:
+        some = [row for row in rows if row["bits_per_px"] == bits]
+        for name, read in (("columns", "left_to_right right_to_left"), ("rows", "top_to_bottom bottom_to_top")):
+            by_rows = _asked([row for row in some if row["read"] in read], "by_rows")
+            others = [_asked(some, kind) for kind in ("left", "above", "curved")] if name == "rows" else [""] * 3
+            lines.append([name, f"{bits:g}", "", "", "", "", "", by_rows, *others])
+    in_use = ", ".join(f"{mean:g} ± {std:g}" for mean, std in zip(MEAN, DEVIATION, strict=True))
+    return (
+        "CODING: points pulled to the motion of neighbouring blocks, fractions of the noise at 0.1 bits per pixel\n"
+        f"in use (left, above, columns, rows, curved): {in_use}\n{numeric_table(header, lines)}"
+    )
 
 
 def _asked(rows: list[Row], kind: str) -> str:
-    """Mean and RMS of the coding errors implied by the captures."""
+    """Mean and standard deviation of the coding errors implied by the captures."""
     asked = np.array([row[kind] for row in rows])
-    return f"{asked.mean():+.1f} {np.sqrt(np.mean(asked**2)):.1f}"
+    return f"{asked.mean():+.3f} ± {asked.std():.3f}"

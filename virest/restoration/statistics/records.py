@@ -264,8 +264,8 @@ class PictureStatistics:
     def colour_error(self) -> tuple[float, float]:
         """Mean square errors of red, green and blue, grey levels squared, by colour differences with these statistics.
 
-        First that which an ideal filter removes from a picture alone, then that which it leaves.  Neighbours add little,
-        since a movie stores a quarter of the colour samples, and coarsely.
+        First that which an ideal filter removes from a picture alone, then that which it leaves.  Neighbours add
+        little, since a movie stores a quarter of the colour samples, and coarsely.
         """
         if not self.measured:
             return 0.0, 0.0
