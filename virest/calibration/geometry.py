@@ -51,13 +51,13 @@ from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
+from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 FEW_POINTS, MANY_POINTS = 2000, 7000
-START_INVERSE_DEPTH_PER_M = 0.5
 EXPLAINED_SCALE = 1.15
 """Whitened residuals with a scale below this need no translation."""
 TRANSLATION_GAIN = 0.97

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
+from virest.capture.pixels import BT601_LUMA
 from virest.capture.records import Frame
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import Array, Indices, Mask
@@ -46,7 +47,7 @@ Gray = NDArray[np.uint8]
 Rgb = NDArray[np.uint8]
 Plane = NDArray[np.float32]
 ReadRgb = Callable[[Sequence[int]], Iterable[tuple[int, Rgb | None]]]
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+LUMA = np.array(BT601_LUMA, np.float32)
 
 GAMMA_STEPS = np.log([0.8, 1.0, 1.25])
 """Steps at which residuals are evaluated for gamma, added to the logarithm of the profile's gamma."""

@@ -39,12 +39,11 @@ from virest.image_formation.row_clock import RowClock
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.time_blocks import halves
+from virest.inference.unsharp_mask import SHARPEST
 from virest.motion.trajectory import Trajectory, turned
 
 Array = NDArray[np.float64]
 
-SHARPEST = 0.4
-"""Fraction of the edges, the sharpest, used to estimate the mask; a soft step overshoots less."""
 MIN_USED = 60
 LOCATION_PX, LOCATION_GROUPS = 20.0, 16
 """Cell size of a scene location: edges whose world directions share a cell, at the lens's focal length, show the same

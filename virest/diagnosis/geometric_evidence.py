@@ -20,6 +20,7 @@ from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
 from virest.inference.time_blocks import varied_blocks
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
+from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import InertialMotion, Motion
 
 __all__ = [
@@ -50,7 +51,6 @@ MAX_DEPTH_PULL, HELD_DEPTH_STD = 4.0, 1e-3
 """If the fit moves a plane by more than MAX_DEPTH_PULL × KNOWN_DEPTH_STD, hold it at the profile's depth (relative σ
 HELD_DEPTH_STD), so that this depth is judged."""
 ITERATIONS = 10
-START_INVERSE_DEPTH_PER_M = 0.5
 MIN_SWAY_DEPTH_PER_M = 1e-4
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from virest.capture.records import Frame
 from virest.inference.edges import parallel_profiles
+from virest.inference.unsharp_mask import MIN_STEP_LEVELS, UNCLIPPED_LEVELS
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -19,8 +20,6 @@ PLATEAU_PX = 5.0
 """A profile must be flat beyond this distance, where the effect of a 2 px unsharp mask has faded."""
 MAX_PLATEAU_RMS = 0.04
 """Maximum rms of a plateau about its level, as a fraction of the step."""
-MIN_STEP_LEVELS = 30.0
-UNCLIPPED_LEVELS = (6.0, 249.0)
 MAX_OFF_PX = 1.0
 """Maximum distance between the gradient maximum and the middle of its step."""
 GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
+from virest.capture.folder import GUESSED_FOCAL
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
 from virest.image_formation.point_model import TrackTable
@@ -26,8 +27,6 @@ WINDOW_S = 3.5
 IMU_PAUSE_PERIODS = 3.0
 MARGIN_S = 0.02
 CELLS, LEAST_IN_CELL, ASTRAY, MOST_ASTRAY = 8, 10, 2.5, 0.5
-GUESSED_FOCAL = 0.8
-"""Focal length of an unknown camera relative to the longer side: a phone's main camera."""
 
 
 @dataclass(frozen=True, slots=True)

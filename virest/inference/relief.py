@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from virest.image_formation.point_model import SMALLEST_DEPTH
-from virest.inference.depth import Sightings
+from virest.inference.depth import NEAR_S, OUTSIDE, Sightings
 from virest.inference.robust import CAUCHY
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief, angles
@@ -29,10 +29,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 LONG_CELLS, SHORT_CELLS = 24, 18
 """Cells along the picture's longer and shorter side."""
-OUTSIDE = 0.05
-"""The grid extends beyond the picture's edge by this fraction of its size."""
-NEAR_S = 1.0
-"""A frame uses points seen within this time of it."""
 ENOUGH_POINTS, MOST_POINTS, NEARBY = 500, 1500, 1 / 32
 """A frame uses the points of the nearest pairs: ENOUGH_POINTS, or up to MOST_POINTS while the parallax stays below
 NEARBY of the picture's longer side."""

@@ -26,7 +26,7 @@ from virest.inference.observed_tracks import WINDOW_S, ObservedTracks
 from virest.inference.profile_terms import FOCAL, NEAR_AXES, SMALL_BIAS, STATED_OFFSET, TIME_OFFSET, UNKNOWN_READOUT
 from virest.inference.relief import View, WindowRelief, find_relief, picture_grid
 from virest.inference.robust import RAYLEIGH_MEDIAN
-from virest.inference.track_fit import Term, TrackFit, fit_tracks, start_scene
+from virest.inference.track_fit import GRAVITY_M_S2, Term, TrackFit, fit_tracks, start_scene
 from virest.motion.optics import settling_time_s
 from virest.motion.scene_motion import InertialMotion
 
@@ -38,6 +38,7 @@ RUNS_PER_WINDOW, RUN_FRAMES = 4, 7
 POINTS_PER_WINDOW = 800
 MIN_POINTS = 200
 START_INVERSE_DEPTH_PER_M = 0.5
+"""Start of every fit of translation: a scene 2 m away, as in rooms."""
 MAX_RELATIVE_STD = 0.1
 """Largest relative standard deviation of scale and velocity (over its rms in a window) of a metric velocity."""
 MAX_FLOW_STD = 0.2
@@ -51,7 +52,7 @@ MAX_UNEXPLAINED = 0.15
 """Largest fraction of the parallax's power that the accelerometer's path may leave unexplained."""
 MAX_SPREAD = 0.6
 """Largest spread of inverse depths about the plane relative to its inverse depth."""
-GRAVITY_M_S2, GRAVITY_TOLERANCE_M_S2 = 9.81, 0.7
+GRAVITY_TOLERANCE_M_S2 = 0.7
 MAX_ITERATIONS = 15
 ROTATION_ITERATIONS = 8
 """The fit with rotation alone serves only for comparison and needs no full convergence."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
-from virest.capture.folder import Capture, Frame
+from virest.capture.folder import GUESSED_FOCAL, Capture, Frame
 from virest.capture.imu import ImuSamples
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import RowClock
@@ -24,7 +24,7 @@ from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
 from virest.inference.coarse_alignment import MIN_EXPLAINED, STEP_S, align_coarsely
 from virest.inference.frame_selection import choose_pairs
 from virest.inference.guide_choice import find_guide
-from virest.inference.observed_tracks import GUESSED_FOCAL, ObservedTracks, observe_tracks
+from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.synchronisation import (
     AGREEMENT_SLACK_S,
     OffsetEstimate,

@@ -18,10 +18,9 @@ from virest.restoration.deblur import deblur
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import rounded
 from virest.restoration.statistics.measure import measure_picture
+from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX
 
 Array = NDArray[np.float64]
-SAMPLE_TILE_PX = 128
-"""Spacing of the tiles on which the picture's noise is measured."""
 LEAST_PART = 1e-6
 """Kernel values below this fraction of the largest count as 0."""
 SAMPLES = 64

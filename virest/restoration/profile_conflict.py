@@ -26,6 +26,7 @@ from virest.inference.robust import RAYLEIGH_MEDIAN
 from virest.inference.time_blocks import even_blocks, halves
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.inference.tracking_bias import bias_std
+from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import Motion
 from virest.restoration.conflict_causes import CAUSES, TWINS, Cause
 
@@ -52,7 +53,6 @@ BLOCKS = 8
 POINTS, START_POINTS, STARTS = 1500, 400, 2
 """Number of points in a fit, and in the ranking of starting values; number of starting values that are fitted."""
 MAX_ITERATIONS = 10
-START_INVERSE_DEPTH_PER_M = 0.5
 TRANSLATION_GAIN = 0.9
 """Include camera translation if it reduces the residual below this fraction of that of rotation alone."""
 

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.capture.pixels import BT601_LUMA
 from virest.image_formation.kernel_spread import KernelSpread
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 
 Array = NDArray[np.float64]
-LUMA_RED, LUMA_BLUE = 0.299, 0.114
+LUMA_RED, _, LUMA_BLUE = BT601_LUMA
 PER_COLOUR_POWER = 1.911
 """Mean square over red, green and blue of what errors of Cr and Cb make, over the mean of their powers.
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
+from virest.inference.robust import NORMAL_MEDIAN
 from virest.restoration.statistics.rings import SIDE
 
 _WINDOW = np.outer(np.hanning(SIDE + 2)[1:-1], np.hanning(SIDE + 2)[1:-1]).astype(np.float32)
@@ -101,7 +102,7 @@ def white_noise(plane: NDArray[np.uint8]) -> float:
     above, here, below = (plane[first : len(plane) - 4 + first : 4].astype(np.int16) for first in (1, 2, 3))
     down = above - 2 * here + below
     residual = down[:, 1:-3:4] - 2 * down[:, 2:-2:4] + down[:, 3:-1:4]
-    return _median(np.abs(residual)) / 0.6745 / 6.0
+    return _median(np.abs(residual)) / NORMAL_MEDIAN / 6.0
 
 
 def _median(levels: NDArray[np.int16]) -> float:
