@@ -71,8 +71,10 @@ SMALL_PART = 0.01
 """Smallest fraction of points that a note states as a number."""
 CONSTANT_EXPOSURE_S = 1e-4
 """If exposures vary by less, an offset cannot be separated from their scale, nor from the timestamp reference."""
-DRIFT_SIGMA, LEAST_DRIFT_S = 4.5, 1e-3
-"""Clock skew is fitted if the drift exceeds this many σ (false-alarm probability 7e-6) and this much per capture."""
+SUSPECTED_SIGMA, DRIFT_SIGMA, LEAST_DRIFT_S = 3.0, 4.5, 1e-3
+"""Clock skew is fitted if one step from the fit without it exceeds SUSPECTED_SIGMA, and this much per capture.  That step
+may be a part of the whole only, so the fit decides: the skew is kept if it exceeds DRIFT_SIGMA (false-alarm probability
+7e-6)."""
 SMALL_DRIFT_S = 0.02
 """Below this drift per capture, and without translation, the fit with a skew starts from the one without."""
 OTHER_FOCAL = 0.1
@@ -144,22 +146,24 @@ def calibrate_geometry(
     joint = _fit_jointly(capture.imu, observed, rough, names)
     drift = joint.held.get("clock-skew")
     span_s = float(np.ptp(joint.fit.seconds))
-    drifts = _clocks_drift(drift, span_s)
-    if drift is not None and drifts:
-        names.append("clock-skew")
+    found = None
+    if drift is not None and _may_drift(drift, span_s):
+        with_skew = [*names, "clock-skew"]
         if rough.is_plain and abs(float(drift.change[0])) * span_s < SMALL_DRIFT_S:
-            _, coarse, start = _started(observed, capture.imu, _skewed(profile, drift), names[:-1])
-            rough = replace(rough, profile=_skewed(joint.fit.profile, drift, float(np.mean(joint.fit.seconds))))
+            _, again, begun = _started(observed, capture.imu, _skewed(profile, drift), names)
+            near = replace(rough, profile=_skewed(joint.fit.profile, drift, float(np.mean(joint.fit.seconds))))
         else:  # the first fit may be far off: search for offset and skew again
-            whole, coarse, start = _started(whole, capture.imu, profile, names)
-            observed = whole.covered(capture.imu, start)
-            rough = _readout_axis(capture.imu, observed.table(FEW_POINTS), start, names)
-        joint = _fit_jointly(capture.imu, observed, rough, names)
-    found = _conclude(capture.imu, profile, start, coarse, rough, joint)
+            whole, again, begun = _started(whole, capture.imu, profile, with_skew)
+            observed = whole.covered(capture.imu, begun)
+            near = _readout_axis(capture.imu, observed.table(FEW_POINTS), begun, with_skew)
+        drifting = _fit_jointly(capture.imu, observed, near, with_skew)
+        skewed = _conclude(capture.imu, profile, begun, again, near, drifting)
+        if abs(skewed.profile.clock_skew - profile.clock_skew) > DRIFT_SIGMA * _skew_std(skewed):
+            found, joint, names = skewed, drifting, with_skew
+            found = replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
+    found = found or _conclude(capture.imu, profile, start, coarse, rough, joint)
     report("joint")
     notes = (*found.notes, *held_notes(joint.held, names), *_uneven_note(found.profile, profile))
-    if drifts:
-        notes = (_drift_note(found, profile.clock_skew), *notes)
     found = replace(found, notes=notes, contradicted=tuple(name for name, value in joint.held.items() if value.wrong))
     return found if lag is None else _with_lag(found, lag)
 
@@ -171,21 +175,25 @@ def _skewed(profile: CameraProfile, skew: HeldValue, at_s: float = 0.0) -> Camer
     return replace(profile, clock_skew=profile.clock_skew + change, time_offset_s=offset_s)
 
 
-def _clocks_drift(skew: HeldValue | None, span_s: float) -> bool:
-    """Whether a skew that was held fixed is significant and large; skew is None if it was fitted.
+def _may_drift(skew: HeldValue, span_s: float) -> bool:
+    """Whether a skew that was held fixed may be significant and large.
 
     A single offset is then right at one instant only, although it looks well determined.
     """
-    if skew is None or skew.std[0] > calibrated("clock_skew").max_std:
+    if skew.std[0] > calibrated("clock_skew").max_std:
         return False
-    return skew.sigma > DRIFT_SIGMA and abs(float(skew.change[0])) * span_s > LEAST_DRIFT_S
+    return skew.sigma > SUSPECTED_SIGMA and abs(float(skew.change[0])) * span_s > LEAST_DRIFT_S
+
+
+def _skew_std(found: GeometryCalibration) -> float:
+    """Standard deviation of a fitted clock skew."""
+    return float(np.max([np.max(np.asarray(v.std, float)) for v in found.values if v.name == "clock_skew"]))
 
 
 def _drift_note(found: GeometryCalibration, given_skew: float) -> str:
     """Note that the clock skew was fitted without being requested."""
-    std = float(np.max([np.max(np.asarray(v.std, float)) for v in found.values if v.name == "clock_skew"]))
     span_ms, skew = 1e3 * float(np.ptp(found.fit.seconds)), found.profile.clock_skew - given_skew
-    drift_ms, std_ms = span_ms * skew, span_ms * std
+    drift_ms, std_ms = span_ms * skew, span_ms * _skew_std(found)
     return f"the clocks drift apart by {drift_ms:+.1f} ± {std_ms:.1f} ms over the capture: clock-skew was fitted too"
 
 

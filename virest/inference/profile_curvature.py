@@ -21,6 +21,8 @@ STEP = 2.0
 """Half the distance of the two values, in Gauss-Newton standard deviations: about one true one."""
 LEAST_CURVATURE = 0.02
 """Smallest curvature in any direction, relative to Gauss-Newton's: what is known to 1/7 of it is not known."""
+SHORTENED = (1.0, 0.5, 0.25, 0.1)
+"""Fractions of a step that are tried until one lowers the loss."""
 NEWTON_STEPS, CONVERGED = 6, 0.05
 """The steps end when one is shorter than this, rms in standard deviations."""
 
@@ -30,17 +32,27 @@ def at_profile_minimum(evidence: TrackEvidence, system: TrackSystem) -> tuple[Tr
 
     The curvature is that of the loss itself, not of its weights.
     """
-    inverse = _inverse_curvature(evidence, system)
+    start, inverse = system, _inverse_curvature(evidence, system)
     spread = np.sqrt(np.diag(inverse))
     for _ in range(NEWTON_STEPS):
         step = inverse @ (system.score.sum(axis=0) - system.prior * system.off)
-        after = _moved(evidence, system, step * min(1.0, 1.0 / max(float(np.max(np.abs(step) / system.limit)), 1e-12)))
-        if after.cost(system.scale) > system.cost(system.scale):
+        step *= min(1.0, 1.0 / max(float(np.max(np.abs(step) / system.limit)), 1e-12))
+        lower = _lower(evidence, system, step)
+        if lower is None:
             break
-        system = after
+        system = lower
         if np.sqrt(np.mean((step / spread) ** 2)) < CONVERGED:
             break
-    return system, inverse
+    return system, inverse if system is start else _inverse_curvature(evidence, system)
+
+
+def _lower(evidence: TrackEvidence, system: TrackSystem, step: Array) -> TrackSystem | None:
+    """The system after the longest of some fractions of a step that lowers the loss; None: none does.
+
+    Away from the minimum the curvature may be too small in some direction, and the step too long.
+    """
+    after = (_moved(evidence, system, part * step) for part in SHORTENED)
+    return next((found for found in after if found.cost(system.scale) <= system.cost(system.scale)), None)
 
 
 def _inverse_curvature(evidence: TrackEvidence, system: TrackSystem) -> Array:

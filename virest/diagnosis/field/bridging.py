@@ -174,9 +174,8 @@ def blur_std_px(fitted: TrackFit, table: TrackTable, form: FieldForm, covariance
     profile, lens = fitted.profile, fitted.profile.intrinsics
     assert lens is not None
     exposure_s = np.asarray(profile.shutter.true_exposure_s(table.second_exposure_s))
-    first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
-    seen = np.concatenate([t + part * exposure_s for t in (first_s, fitted.seconds) for part in (-0.5, 0.0, 0.5)])
-    seen = np.unique(np.round(seen, 3))
+    middles_s = np.stack([seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s), fitted.seconds])
+    seen = np.unique(np.round(middles_s[:, None] + np.multiply.outer((-0.5, 0.0, 0.5), exposure_s), 3))
     ends = np.cumsum([np.size(field.values) for field in form.fields])[:-1]
     found = []
     for field, basis in zip(form.fields, np.split(form.basis, ends), strict=True):
