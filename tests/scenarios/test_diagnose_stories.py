@@ -74,8 +74,8 @@ def test_a_filtered_gyroscope_and_pixels_that_are_not_square_are_both_named(work
     assert extended.intrinsics.fy_px / extended.intrinsics.fx_px == pytest.approx(0.97, abs=0.005)
 
 
-def test_a_fault_without_a_name_is_said_to_be_unexplained(work: Path) -> None:
-    """A gyroscope that clips is in no catalogue."""
+def test_a_fault_without_a_name_is_described_and_no_cause_stands_in_for_it(work: Path) -> None:
+    """A gyroscope that clips for a third of the time is in no catalogue; its rates are found from the points."""
     folder = _capture(work, "clipping_gyroscope", [], 423)
     log = folder / "gyro_accel.csv"
     head, *rows = log.read_text(encoding="utf-8").splitlines()
@@ -86,5 +86,8 @@ def test_a_fault_without_a_name_is_said_to_be_unexplained(work: Path) -> None:
         clipped.append(",".join(cells))
     log.write_text("\n".join(clipped) + "\n", encoding="utf-8")
     found = diagnose_folder(folder)
-    assert found.verdict == UNEXPLAINED
-    assert found.unexplained.significant
+    assert found.verdict == EXPLAINED
+    assert not found.causes
+    (field,) = found.fields
+    assert "it clips" in field.sentence
+    assert field.held_out.after < 1.5 * field.held_out.noise < 0.1 * field.held_out.before
