@@ -13,7 +13,7 @@ import pytest
 
 from virest.app.bench.diagnosis import diagnose_folder, errors_in_std
 from virest.app.simulate import simulate_command
-from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis
+from virest.diagnosis.findings import CONSISTENT, EXPLAINED, Diagnosis
 
 pytestmark = pytest.mark.scenario
 
