@@ -72,9 +72,10 @@ SMALL_PART = 0.01
 CONSTANT_EXPOSURE_S = 1e-4
 """If exposures vary by less, an offset cannot be separated from their scale, nor from the timestamp reference."""
 SUSPECTED_SIGMA, DRIFT_SIGMA, LEAST_DRIFT_S = 3.0, 4.5, 1e-3
-"""Clock skew is fitted if one step from the fit without it exceeds SUSPECTED_SIGMA, and this much per capture.  That step
-may be a part of the whole only, so the fit decides: the skew is kept if it exceeds DRIFT_SIGMA (false-alarm probability
-7e-6)."""
+"""Clock skew is fitted if one step from the fit without it exceeds SUSPECTED_SIGMA, and this much per capture.
+
+That step may be a part of the whole only, so the fit decides: the skew is kept if it exceeds DRIFT_SIGMA (false-alarm
+probability 7e-6)."""
 SMALL_DRIFT_S = 0.02
 """Below this drift per capture, and without translation, the fit with a skew starts from the one without."""
 OTHER_FOCAL = 0.1
