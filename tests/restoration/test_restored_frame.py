@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -13,8 +14,11 @@ from laws import TurningCamera, phone, psnr_db, texture
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
+from virest.image_formation.kernels import KernelField
 from virest.image_formation.row_motion import FrameTranslation, row_motion
 from virest.inference.unsharp_mask import UnsharpMask, without_mask
+from virest.restoration.blurred import luma_of
+from virest.restoration.colour import _consistent_light
 from virest.restoration.frame import (
     RestoredFrame,
     copied_frame,
@@ -492,3 +496,21 @@ def test_a_saturated_surface_gets_no_stripes_of_what_lies_beside_it(preset: str)
     inside = from_disc[MARGIN:-MARGIN, MARGIN:-MARGIN] < 50
     shown, wanted = (picture[..., 0][inside].astype(float) for picture in (result, recorded.truth))
     assert np.sqrt(np.mean((shown - wanted) ** 2)) < 2.5, "1.1 as recorded, 3 by the linear filter alone"
+
+
+def test_light_that_agrees_is_left_alone_below_nothing_too() -> None:
+    """A curve's zero of light is a convention: plain surfaces stay, whichever side of it they lie on."""
+    curve = ResponseCurve("five_segment", b=(0.12, 0.14), c=(0.62, 0.88), y_max=1.0)
+    assert curve.light_range[0] < -0.05
+    channels = [np.full((40, 60), light, np.float32) for light in (-0.05, 0.1, 0.3)]
+    path_px = np.linspace(-6, 6, 16)[:, None] * (1.0, 0.3)
+
+    def field(centres_px: NDArray[np.float64]) -> KernelField:
+        return KernelField(centres_px, np.repeat(path_px[None], len(centres_px), 0), 0.5)
+
+    statistics = SimpleNamespace(noise_levels=1.0, colour_noise_levels=1.0)
+    blurred: Any = SimpleNamespace(
+        longest_px=12.0, curve=curve, statistics=statistics, chroma=statistics, clipped=[None], dark=[None], field=field
+    )
+    found = _consistent_light(blurred, luma_of(channels), channels, channels, 2, 2)
+    np.testing.assert_allclose(found, channels, atol=1e-4)

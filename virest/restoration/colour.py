@@ -215,16 +215,19 @@ def _consistent_light(
     A linear filter rings around edges, and its negative light is cut off.  A channel that is nearly dark, as red is on
     a green leaf, is then too bright, and the tone curve's steep slope shows the ringing as stripes.  Each of
     Richardson–Lucy's steps corrects the light by the ratio of what was recorded to what it would record, and leaves
-    alone what agrees.  The noise of the recorded light is added to both sides of the ratio; light that was not measured
-    corrects nothing.  The luma, restored with a better prior, stays as it is.  All are ``scale`` times smaller than the
-    picture.
+    alone what agrees.  Light is counted from the curve's darkest, which may be below 0.  The noise of the recorded
+    light is added to both sides of the ratio; light that was not measured corrects nothing.  The luma, restored
+    with a better prior, stays as it is.  All are ``scale`` times smaller than the picture.
     """
-    seen, light = cv2.merge(recorded), cv2.max(cv2.merge(restored), 0.0)
     if blurred.longest_px < scale:
-        return cv2.split(light)
+        return restored
+    darkest = np.float32(min(blurred.curve.light_range[0], 0.0))
+    seen, light, luma = cv2.merge(recorded) - darkest, cv2.merge(restored) - darkest, luma - darkest
+    light = cv2.max(light, 0.0)
     blur, unblur = _blur_along_paths(blurred, seen.shape[:2], scale)
     noise = np.hypot(blurred.statistics.noise_levels, blurred.chroma.colour_noise_levels)
-    least = float(blurred.curve.linear_table()[int(np.clip(np.rint(noise), 1, 255))])
+    table = blurred.curve.linear_table()
+    least = float(table[int(np.clip(np.rint(noise), 1, 255))] - table[0])
     measured = _measured(blurred, scale)
     for _ in range(steps):
         ratio = cv2.divide(seen + least, blur(light) + least)
@@ -233,7 +236,7 @@ def _consistent_light(
         light = cv2.multiply(light, unblur(ratio))
     channels = cv2.split(light)
     brighter = cv2.divide(cv2.max(luma, 0.0), cv2.max(luma_of(list(channels)), LEAST_LIGHT))
-    return [cv2.multiply(channel, brighter) for channel in channels]
+    return [cv2.multiply(channel, brighter) + darkest for channel in channels]
 
 
 def _blur_along_paths(
