@@ -15,7 +15,7 @@ from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import KernelSpread
 from virest.image_formation.kernels import KernelField
 from virest.restoration.neighbours.joint import NeighbourPicture
-from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
+from virest.restoration.statistics.records import LUMA_BLUE, LUMA_GREEN, LUMA_RED, PictureStatistics
 
 CLIPPED_LEVELS = 2.0
 """Pixels within this many grey levels of the top count as clipped."""
@@ -164,7 +164,7 @@ def _holes(clipped: list[Image | None], longest_px: float) -> Image | None:
 def luma_of(light: list[Image]) -> Image:
     """Luma of linear light.  It is restored separately from the colour differences, whose noise and detail differ."""
     red, green, blue = light
-    return cv2.scaleAdd(blue, LUMA_BLUE, cv2.addWeighted(red, LUMA_RED, green, 1 - LUMA_RED - LUMA_BLUE, 0.0))
+    return cv2.scaleAdd(blue, LUMA_BLUE, cv2.addWeighted(red, LUMA_RED, green, LUMA_GREEN, 0.0))
 
 
 def with_vignetting(light: Image, blurred: BlurredPicture) -> Image:

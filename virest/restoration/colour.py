@@ -16,13 +16,14 @@ from virest.restoration.neighbours.joint import HALF, NeighbourPicture
 from virest.restoration.row_chunks import RowRenderer
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.statistics.measure import STORED_COLOUR_PX
-from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
+from virest.restoration.statistics.records import LUMA_BLUE, LUMA_GREEN, LUMA_RED, PictureStatistics
 from virest.restoration.statistics.tile_power import variance_within
 from virest.restoration.tile_layout import (
     COARSE_OVERLAP,
     in_tiles,
     join_neighbours,
     noise_to_signal,
+    sampled_kernels,
     tile_deconvolution,
 )
 
@@ -39,8 +40,8 @@ s²/6, against L²/12.  With shorter paths the coarse scale would lose detail.""
 DETAIL_SCATTER = 1.0
 """Standard deviation of the logarithm of a tile's power at 0.04 to 0.3 cycles per pixel, given its variance: 384 tiles
 of 256 px in 32 sharp frames of photographs, print and drawings."""
-FIELD_SAMPLES, LIGHT_STEPS = (6, 5), 2
-"""Rows and columns of the grid on which paths are computed to correct light, and number of corrections.
+LIGHT_STEPS = 2
+"""Number of corrections of the light.
 
 The first gains 0.1 to 0.35 dB, the second up to 0.1, two more up to 0.05 or lose as much (three captures).  With few
 iterations one is made."""
@@ -197,8 +198,7 @@ def _shrunk(sharp: Image, blurred: BlurredPicture, scale: int) -> Image:
 
 def _three_differences(red: Image, blue: Image) -> list[Image]:
     """Light of red, green and blue minus the luma's, from that of red and blue."""
-    green_luma = 1 - LUMA_RED - LUMA_BLUE
-    return [red, cv2.addWeighted(red, -LUMA_RED / green_luma, blue, -LUMA_BLUE / green_luma, 0.0), blue]
+    return [red, cv2.addWeighted(red, -LUMA_RED / LUMA_GREEN, blue, -LUMA_BLUE / LUMA_GREEN, 0.0), blue]
 
 
 def _grey_differences(blurred: BlurredPicture, luma: Image, channels: Sequence[Image]) -> list[Image]:
@@ -247,17 +247,12 @@ def _blur_along_paths(
     Instants are a pixel apart along the path; paths vary smoothly over the picture.
     """
     height, width = shape
-    y, x = (
-        (np.arange(k) + 0.5) * length * scale / k - 0.5
-        for k, length in zip(FIELD_SAMPLES, (height, width), strict=True)
-    )
-    field = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)).scaled(1 / scale)
-    paths_px = field.paths_px.reshape(len(y), len(x), -1, 2).astype(np.float32)
+    _, _, recorded_px, recorded_sigma_px = sampled_kernels(blurred)
+    paths_px, sigma_px = (recorded_px / scale).astype(np.float32), float(recorded_sigma_px.mean()) / scale
     count = int(np.clip(np.ceil(blurred.longest_px / scale), 2, paths_px.shape[2]))
     instants = ((np.arange(count) + 0.5) / count * paths_px.shape[2]).astype(int).tolist()
     own = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), -1)
     moved = [cv2.resize(paths_px[:, :, k], (width, height), interpolation=cv2.INTER_LINEAR) for k in instants]
-    sigma_px = float(np.mean(field.defocus_sigma_px))
 
     def gathered(picture: Image, sign: int) -> Image:
         whole = np.zeros_like(picture)

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from virest.image_formation.blur import Image
 from virest.restoration import tiles
@@ -16,6 +17,7 @@ from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.on_tiles import on_spectrum, packed, packed_frequency
 from virest.restoration.statistics.records import PictureStatistics
 
+Array = NDArray[np.float64]
 Surroundings = tuple[float, int, int]
 """Fraction of the overlap that the margin is reduced by, least margin, px, and least bridge, px."""
 FULL_MARGIN, THIN_MARGIN, THINNEST_MARGIN = (0.0, 16, 16), (0.3, 4, 16), (0.3, 3, 12)
@@ -64,19 +66,27 @@ def _largest_sides_px(blurred: BlurredPicture) -> tuple[float, float]:
     deviations.  Paths vary over the picture with camera roll and row time; defocus increases towards the corners.  With
     more noise both matter less.
     """
-    height, width = blurred.light[0].shape
-    y, x = (
-        (np.arange(count) + 0.5) * length / count for count, length in zip(FIELD_SAMPLES, (height, width), strict=True)
-    )
-    field = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
-    paths_px = field.paths_px[:, ::4].reshape(len(y), len(x), -1, 2)
-    changes = [np.diff(paths_px, axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
+    y, x, paths_px, sigma_px = sampled_kernels(blurred)
+    changes = [np.diff(paths_px[:, :, ::4], axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
     per_px = np.sqrt(0.5 * sum(np.mean(np.linalg.norm(c, axis=-1).mean(-1)) ** 2 for c in changes))
-    sigma_px = np.broadcast_to(field.defocus_sigma_px, len(field.paths_px)).reshape(len(y), len(x))
     softer = np.mean(np.hypot(*np.gradient(sigma_px, y, x)))
     wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale
     path_side_px, defocus_side_px = (float(3 * wrong_px / max(change, 1e-6)) for change in (per_px, softer))
     return path_side_px, defocus_side_px
+
+
+def sampled_kernels(blurred: BlurredPicture) -> tuple[Array, Array, Array, Array]:
+    """Kernels at the middles of equal parts of the picture: the parts' y and x, paths (y, x, m, 2), defocus (y, x).
+
+    All in px.
+    """
+    y, x = (
+        (np.arange(count) + 0.5) * length / count - 0.5
+        for count, length in zip(FIELD_SAMPLES, blurred.light[0].shape, strict=True)
+    )
+    field = blurred.field(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
+    sigma_px = np.broadcast_to(field.defocus_sigma_px, len(field.paths_px))
+    return y, x, field.paths_px.reshape(len(y), len(x), -1, 2), sigma_px.reshape(len(y), len(x))
 
 
 def tile_deconvolution(

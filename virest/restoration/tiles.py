@@ -146,10 +146,9 @@ class TileDeconvolution:
 
         Registration error acts as extra noise, (1 − s²) |K|² of the signal, and so does the kernel's variance, beside
         the frame's own, N / S ``ratio``; both reduce the further picture's weight.  Its power E|K|² stays, as in any
-        expected data term.  A
-        tile weighs by its mean trust.  Untrusted pixels are replaced by the linear filter's estimate from the pictures
-        joined so far, blurred by the further picture's kernel, which adds no information; so pictures that are trusted
-        all over a tile are joined first.
+        expected data term.  A tile weighs by its mean trust.  Untrusted pixels are replaced by the linear filter's
+        estimate from the pictures joined so far, blurred by the further picture's kernel, which adds no information; so
+        pictures that are trusted all over a tile are joined first.
 
         Noise may be common to all pictures, since a coder repeats a still scene with its noise.  Common noise N is
         back-projected to |Σ w K|² N, independent noise to Σ w |K|² N.  Along different paths the former is no larger;

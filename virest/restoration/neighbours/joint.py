@@ -151,14 +151,11 @@ def register_neighbour(
     number: int,
     agreement: TileAgreement,
     independent_error: float,
-    spread: KernelSpread | None = None,
 ) -> NeighbourRegistration | None:
     """Register a neighbour to the frame; None with fewer than 2 LEAST_SHIFTS usable tiles.
 
     field: the neighbour's kernels, from the view.  independent_error: expected mean square difference by independent
     noise.
-
-    spread: uncertainty of the kernels; None: exact.
     """
     used = agreement.precision > 0
     if np.count_nonzero(used) < 2 * LEAST_SHIFTS:
@@ -168,9 +165,8 @@ def register_neighbour(
     height, width = trust.shape
     seen = (agreement.inside & ~agreement.clipped)[:height, :width]
     return NeighbourRegistration(
-        number, view, shift, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px,
-        spread=spread,
-    )  # fmt: skip
+        number, view, shift, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px
+    )
 
 
 def resample_neighbour(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
+from virest.capture.pixels import BT601_LUMA
 from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import kernel_spread
 from virest.image_formation.kernels import KernelField, kernel_field
@@ -40,7 +41,7 @@ from virest.restoration.neighbours.registration import (
     pair_turn,
     tile_agreement,
 )
-from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics
+from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.rings import RINGS
 
 TYPICAL_WEIGHTS = (1.0, 0.95, 0.85)
@@ -182,14 +183,14 @@ class FrameNeighbours:
         level = 255 * float(curve.encode(np.array(agreement.light)))
         slope = float(np.interp(level, np.arange(256), curve.slope_table()))
         error = agreement.expected_error(luma.frequency, luma.noise, slope)
+        registration = register_neighbour(view, along, other.frame.index, agreement, error)
+        if registration is None:
+            return None
         spread = None
         if refined is not None:  # the rate is as uncertain in the neighbour as in the frame
             profile, of_path = here.motion.profile, replace(refined, motion=other.motion).path_covariance_px2()
             spread = kernel_spread(along, profile.width, profile.height, of_path)
-        registration = register_neighbour(view, along, other.frame.index, agreement, error, spread)
-        return (
-            None if registration is None else replace(registration, coding_noise_ratio=_coding_noise_ratio(other, here))
-        )
+        return replace(registration, coding_noise_ratio=_coding_noise_ratio(other, here), spread=spread)
 
     def with_missing_turn(self, missing: MissingTurn | None) -> FrameNeighbours:
         """A copy with the capture's missing rotation, which shares the pair comparisons made so far."""
@@ -260,7 +261,7 @@ def _luma_and_half(sight: Sight) -> tuple[Image, Image]:
     """Luma of a frame's linear light, (height, width), and its light at half the size, (height / 2, width / 2, 3)."""
     assert sight.motion is not None
     light = cv2.LUT(sight.picture, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
-    weights = np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)
+    weights = np.array([BT601_LUMA], np.float32)
     return np.asarray(cv2.transform(light, weights), np.float32), half_size(light)
 
 

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
+from virest.capture.pixels import BT601_LUMA
 from virest.image_formation.kernels import KernelField
 from virest.restoration.statistics.place_fit import place_statistics, unevenness
-from virest.restoration.statistics.records import LUMA_BLUE, LUMA_RED, PictureStatistics, unknown_picture
+from virest.restoration.statistics.records import PictureStatistics, unknown_picture
 from virest.restoration.statistics.ring_fit import RingCells, fit_rings
 from virest.restoration.statistics.rings import SIDE
 from virest.restoration.statistics.tile_power import (
@@ -148,7 +149,7 @@ def _luma_light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.flo
     light = cv2.LUT(tile, curve.linear_table())
     if light.ndim == 2:
         return np.asarray(light, np.float32)
-    return np.asarray(cv2.transform(light, np.array([[LUMA_RED, 1 - LUMA_RED - LUMA_BLUE, LUMA_BLUE]], np.float32)))
+    return np.asarray(cv2.transform(light, np.array([BT601_LUMA], np.float32)))
 
 
 def _least_clipped(

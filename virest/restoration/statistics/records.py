@@ -15,11 +15,11 @@ from virest.image_formation.kernel_spread import KernelSpread
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 
 Array = NDArray[np.float64]
-LUMA_RED, _, LUMA_BLUE = BT601_LUMA
-PER_COLOUR_POWER = 1.911
-"""Mean square over red, green and blue of what errors of Cr and Cb make, over the mean of their powers.
+LUMA_RED, LUMA_GREEN, LUMA_BLUE = BT601_LUMA
+PER_COLOUR_POWER = sum((2 * (1 - own)) ** 2 * (1 + (own / LUMA_GREEN) ** 2) / 3 for own in (LUMA_RED, LUMA_BLUE))
+"""Mean square over red, green and blue of what errors of Cr and Cb make, over the mean of their powers: 1.91.
 
-By ITU-R BT.601 they change red by 1.402 Cr, green by −0.714 Cr − 0.344 Cb, and blue by 1.772 Cb."""
+By ITU-R BT.601 they change red by 2 (1 − 0.299) Cr, blue by 2 (1 − 0.114) Cb, and green so that luma stays."""
 _HYPER_LAPLACIAN_RMS = 3.62
 """RMS of a variable with density ∝ exp(−|x|^⅔): sqrt(Γ(9/2)/Γ(3/2))."""
 _EDGES_BEYOND = 2.0
