@@ -510,7 +510,14 @@ def test_light_that_agrees_is_left_alone_below_nothing_too() -> None:
 
     statistics = SimpleNamespace(noise_levels=1.0, colour_noise_levels=1.0)
     blurred: Any = SimpleNamespace(
-        longest_px=12.0, curve=curve, statistics=statistics, chroma=statistics, clipped=[None], dark=[None], field=field
+        longest_px=12.0,
+        curve=curve,
+        statistics=statistics,
+        chroma=statistics,
+        clipped=[None],
+        dark=[None],
+        field=field,
+        light=[np.zeros((80, 120), np.float32)],
     )
     found = _consistent_light(blurred, luma_of(channels), channels, channels, 2, 2)
     np.testing.assert_allclose(found, channels, atol=1e-4)
