@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,13 +30,14 @@ _RELIEF_STEPS = 3
 class FrameTranslation:
     """The motion of the camera's centre during one frame, and the scene in front of it.
 
-    All in camera axes at the frame's reference time t_ref: the centre is at v (t − t_ref) + ½ a (t − t_ref)².
+    All in camera axes at the frame's reference time t_ref: the centre is at v s + a s²/2 + j s³/6 + k s⁴/24 with
+    s = t − t_ref.
     """
 
     velocity_m_s: Array
     """(3,) at the reference time."""
     acceleration_m_s2: Array
-    """(3,) constant over the frame, without gravity."""
+    """(3,) at the reference time, without gravity."""
     inverse_depth_plane: Array
     """(3,) 1/m: the inverse depth along the optical axis of a ray r with z = 1 is plane · r, floored at 0."""
     depth_m: float | None = None
@@ -47,11 +48,17 @@ class FrameTranslation:
     """Relief on the plane, at the reference time; None: unknown or none."""
     in_metres: bool = True
     """False: only velocity over depth is known; lengths have a common unknown unit and must not be logged as metres."""
+    jerk_m_s3: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) j, at the reference time."""
+    snap_m_s4: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) k: constant, and 0 for the motion over a single frame."""
 
     def position_m(self, since_reference_s: Array) -> Array:
         """Centre (..., 3) at times (...) from the reference."""
-        since = np.asarray(since_reference_s, float)[..., None]
-        return since * (np.asarray(self.velocity_m_s) + 0.5 * since * np.asarray(self.acceleration_m_s2))
+        s = np.asarray(since_reference_s, float)[..., None]
+        return np.asarray(
+            s * (self.velocity_m_s + s / 2 * (self.acceleration_m_s2 + s / 3 * (self.jerk_m_s3 + s / 4 * self.snap_m_s4)))
+        )
 
     def inverse_depth(self, rays: Array) -> Array:
         """1 / depth (...) along the optical axis at the reference time, where rays (..., 3), z = 1, meet the scene."""
@@ -60,8 +67,20 @@ class FrameTranslation:
 
     def velocity_at(self, since_reference_s: Any) -> Array:
         """Velocity (..., 3) of the centre at times (...) from the reference, still in the axes at the reference."""
-        since = np.asarray(since_reference_s, float)[..., None]
-        return np.asarray(self.velocity_m_s) + since * np.asarray(self.acceleration_m_s2)
+        s = np.asarray(since_reference_s, float)[..., None]
+        return np.asarray(
+            self.velocity_m_s + s * (self.acceleration_m_s2 + s / 2 * (self.jerk_m_s3 + s / 3 * self.snap_m_s4))
+        )
+
+    def meeting(self, velocity_m_s: Array, acceleration_m_s2: Array, after_s: float) -> FrameTranslation:
+        """The same motion continued to another velocity and acceleration (3,) at a time from the reference.
+
+        Both in this motion's axes.  The velocity is the cubic between the two instants (Hermite's interpolation).
+        """
+        gained = acceleration_m_s2 - self.acceleration_m_s2
+        beyond = velocity_m_s - self.velocity_m_s - after_s * self.acceleration_m_s2
+        snap = 12 * (gained * after_s / 2 - beyond) / after_s**3
+        return replace(self, jerk_m_s3=gained / after_s - snap * after_s / 2, snap_m_s4=snap)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,13 +241,23 @@ def row_motion(
 def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, lens: MovingLens) -> RowMotion:
     """The motion of one frame, tabulated over the rows of another frame too; its row clock and reference are kept.
 
-    lens: for the whole trajectory.  The translation is extrapolated with the frame's own acceleration.
+    lens: for the whole trajectory.  The translation leads from the frame's to the other frame's; where that is unknown,
+    it is extrapolated with the frame's own acceleration.
     """
     span_s = min(motion.start_s, other.start_s), max(motion.end_s, other.end_s)
     return _tabulated(
         trajectory, span_s, motion.start_s, motion.exposure_s, motion.reference_s, motion.profile, lens,
-        motion.translation,
+        _leading_to(motion, other, trajectory),
     )  # fmt: skip
+
+
+def _leading_to(motion: RowMotion, other: RowMotion, trajectory: Trajectory) -> FrameTranslation | None:
+    """A frame's translation, continued to that of another frame where both are known in metres."""
+    here, there, after_s = motion.translation, other.translation, other.reference_s - motion.reference_s
+    if here is None or there is None or not (here.in_metres and there.in_metres) or not after_s:
+        return here
+    turn = trajectory.orientation(motion.reference_s).T @ trajectory.orientation(other.reference_s)
+    return here.meeting(turn @ there.velocity_m_s, turn @ there.acceleration_m_s2, after_s)
 
 
 def with_row_clock_of(motion: RowMotion, other: RowMotion) -> RowMotion:

@@ -21,6 +21,8 @@ OFFSET_FLOOR_S = 3e-5
 """Systematic error of the time offset, added to its standard deviation."""
 ACCEL_SCALE_STD = 0.01
 """Scale error of a phone's accelerometer (sensitivity tolerance of its makers); lengths scale with it."""
+LEAST_SPAN_S = 0.002
+"""Shortest time, s, over which a frame's acceleration and jerk are taken: frames without readout may be shorter."""
 NEAR_WINDOW_S = 1.5
 """Frames up to this far from a window's tracked points still use its velocity."""
 
@@ -235,7 +237,9 @@ class FrameMotion:
     reference_s: float
     """Camera clock."""
     acceleration_m_s2: Array
-    """(3,) mean over the frame, without gravity."""
+    """(3,) at the reference time, without gravity."""
+    jerk_m_s3: Array
+    """(3,) constant over the frame."""
     depth: FrameDepth
     unscaled: str = ""
     """Why velocity is known only over depth, not in metres; empty if it is known in metres."""
@@ -292,12 +296,12 @@ class VisualInertialAlignment:
             return found
         stretch, window = found
         known = stretch.fit.integrated
-        time_s = np.asarray(known.profile.imu_time_s(np.array([reference_s, start_s, max(end_s, start_s + 1e-3)])))
-        velocity = stretch.velocity(window, time_s)
-        rotation = known.trajectory.orientation(time_s[0])
-        acceleration = (velocity[2] - velocity[1]) / (time_s[2] - time_s[1])
+        seen_s = np.array([reference_s, *np.linspace(start_s, max(end_s, start_s + LEAST_SPAN_S), 3)])
+        time_s = np.asarray(known.profile.imu_time_s(seen_s))
+        velocity = stretch.velocity(window, time_s) @ known.trajectory.orientation(time_s[0])
+        half_jerk, acceleration, _ = np.polyfit(time_s[1:] - time_s[0], velocity[1:], 2)
         depth = stretch.depth(window, float(time_s[0]))
-        return FrameMotion(velocity[0] @ rotation, reference_s, acceleration @ rotation, depth, unscaled)
+        return FrameMotion(velocity[0], reference_s, acceleration, 2 * half_jerk, depth, unscaled)
 
     def velocity_std_m_s(self, camera_time_s: Array) -> Array:
         """Standard deviations (n, 3) of the velocity in camera axes at times (n,); NaN where not known in metres.

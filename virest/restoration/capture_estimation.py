@@ -320,6 +320,7 @@ def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTran
         "triangulated" if stated_depth_m is None else "profile",
         depth.relief,
         not motion.unscaled,
+        motion.jerk_m_s3,
     )
 
 
