@@ -17,6 +17,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import KernelSpread
@@ -55,8 +56,8 @@ LEAST_SHIFTS = 6
 LOOKED_AT = 6
 """Number of kernels from which a neighbour's |K|² is estimated."""
 HUBER, ROBUST_STEPS = 1.5, 6
-BESIDE = 1.1
-"""Tiles whose distance, over their side, is at most this are side by side; diagonal ones are 1.3 to 1.4 apart."""
+REACHES, PARTS = (1.0, 2.0, 4.0), tuple(np.linspace(0.0, 0.95, 20).tolist())
+"""Tried reaches of the shifts' common part, in tiles' sides, and its parts of their power."""
 CUBIC = -0.75
 """Slope at one pixel of the kernel of OpenCV's cubic interpolation."""
 LONGEST_ROW = 2**14
@@ -334,36 +335,40 @@ def _shift_field(agreement: TileAgreement, used: NDArray[np.bool_]) -> tuple[Shi
     """The shifts over the picture, the tiles' noise per axis, px, and the field's deviation (n,) per axis, px.
 
     Affine, plus what adjacent tiles share: a rest of the stabiliser, rolling-shutter wobble, relief.  That part is
-    taken for a random field with the correlation exp(−½ (d / side)²) over the distance d, in which tiles' noise is
+    taken for a random field with the correlation exp(−½ (d / reach)²) over the distance d, in which tiles' noise is
     independent, and is estimated with the least expected error (kriging; Cressie 1993,
     doi:10.1002/9781119115151).
     """
     centres_px, side_px = agreement.centres_px, float(TILE * agreement.times)
     affine, typical_px = _affine(centres_px[used], agreement.shift_px[used], agreement.precision[used])
     off_px = agreement.shift_px[used] - _at(affine, centres_px[used])
-    length_px = np.linalg.norm(off_px, axis=1)
-    common_px = _common_shift_px(centres_px[used], off_px, typical_px, side_px)
-    noise_px = float(np.sqrt(max(typical_px**2 - common_px**2, 0.0)))
+    doubt = np.maximum(1.0, np.linalg.norm(off_px, axis=1) / (HUBER * typical_px)) ** 2
     apart = np.linalg.norm(centres_px[:, None] - centres_px, axis=-1) / side_px
-    together = common_px**2 * np.exp(-0.5 * apart**2)
-    noise_px2 = noise_px**2 * np.maximum(1.0, length_px / (HUBER * typical_px)) ** 2 + 1e-6
-    gain = np.linalg.solve(together[np.ix_(used, used)] + np.diag(noise_px2), together[used]).T
+    common_px, noise_px, reach = _likeliest_field(off_px, doubt, apart[np.ix_(used, used)])
+    together = common_px**2 * np.exp(-0.5 * (apart / reach) ** 2)
+    gain = np.linalg.solve(together[np.ix_(used, used)] + np.diag(noise_px**2 * doubt), together[used]).T
     left_px2 = np.maximum(common_px**2 - np.einsum("ij,ji->i", gain, together[used]), 0.0)
     of_affine_px2 = noise_px**2 * LEAST_SHIFTS / len(off_px)
     return ShiftField(affine, centres_px, gain @ off_px), noise_px, np.sqrt(left_px2 + of_affine_px2)
 
 
-def _common_shift_px(centres_px: Array, off_px: Array, typical_px: float, spacing_px: float) -> float:
-    """Deviation, per axis, of the part of shifts (n, 2) common to adjacent tiles: the affine field's error, not noise.
+def _likeliest_field(off_px: Array, doubt: Array, apart: Array) -> tuple[float, float, float]:
+    """Deviations, per axis, of a random field and of tiles' noise, px, and the field's reach in tiles' sides.
 
-    The noise of adjacent tiles is independent, so the mean product of their shifts is the power of the common part.
+    Those with the greatest likelihood of the shifts off_px (n, 2).  doubt: (n,) each tile's noise power over the usual.
+    apart: (n, n) distances in tiles' sides.
     """
-    length = np.linalg.norm(off_px, axis=1, keepdims=True)
-    held = off_px * np.minimum(1.0, 2 * HUBER * typical_px / np.maximum(length, 1e-9))
-    apart = np.linalg.norm(centres_px[:, None] - centres_px, axis=-1)
-    beside = (apart > 0) & (apart <= BESIDE * spacing_px)
-    products = (held @ held.T)[beside]
-    return float(np.sqrt(max(products.mean() / 2, 0.0))) if len(products) else typical_px
+    size, best = off_px.size, (np.inf, 0.0, 1.0, 1.0)
+    for reach in REACHES:
+        together = np.exp(-0.5 * (apart / reach) ** 2)
+        for part in PARTS:
+            root = np.linalg.cholesky(part * together + (1 - part) * np.diag(doubt))
+            white = solve_triangular(root, off_px, lower=True)
+            power = max(float((white**2).sum()) / size, 1e-6)
+            unlikely = size * np.log(power) + 4 * float(np.log(np.diag(root)).sum())
+            best = min(best, (unlikely, power, part, reach))
+    _, power, part, reach = best
+    return float(np.sqrt(part * power)), float(np.sqrt((1 - part) * power)), reach
 
 
 def _between_tiles(values: Array, tiles_px: Array, points_px: Array) -> Array:
