@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
 from virest.image_formation.kernels import KernelField
-from virest.restoration import blurred, clipped_light, colour, tile_layout
+from virest.restoration import blurred, clipped_light, tile_layout
 from virest.restoration.settings import PRESETS
 from virest.restoration.statistics.records import PictureStatistics
 
@@ -57,11 +57,11 @@ def test_clipped_light_stays_clipped_in_the_smaller_picture() -> None:
 def test_blocks_at_the_edge_are_means_of_what_is_there(rng: np.random.Generator) -> None:
     """Whole squares, and the narrower rest at the right and below, each have the mean of their own pixels."""
     plane = rng.random((11, 16)).astype(np.float32)
-    means = colour._block_means(plane, 3)
+    means = blurred.block_means(plane, 3)
     assert means.shape == (4, 6)
     expected = [[plane[r : r + 3, c : c + 3].mean() for c in range(0, 16, 3)] for r in range(0, 11, 3)]
     np.testing.assert_allclose(means, expected, rtol=1e-5)
-    np.testing.assert_allclose(colour._block_means(plane[:8], 4), plane[:8].reshape(2, 4, 4, 4).mean((1, 3)), rtol=1e-5)
+    np.testing.assert_allclose(blurred.block_means(plane[:8], 4), plane[:8].reshape(2, 4, 4, 4).mean((1, 3)), rtol=1e-5)
 
 
 def test_tiles_are_as_large_as_their_kernels_hold() -> None:

@@ -18,13 +18,13 @@ from virest.image_formation.kernels import KernelField
 from virest.image_formation.row_motion import FrameTranslation, row_motion
 from virest.inference.unsharp_mask import UnsharpMask, without_mask
 from virest.restoration.blurred import luma_of
-from virest.restoration.colour import _consistent_light
 from virest.restoration.frame import (
     RestoredFrame,
     copied_frame,
     restore_frame,
 )
 from virest.restoration.parameters import degradation_parameters, unknown_parameters
+from virest.restoration.positive_light import consistent_light, without_negative_light
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
 from virest.restoration.statistics.of_picture import most_blurred
 from virest.simulation.phone_pictures import sharpen
@@ -498,18 +498,14 @@ def test_a_saturated_surface_gets_no_stripes_of_what_lies_beside_it(preset: str)
     assert np.sqrt(np.mean((shown - wanted) ** 2)) < 2.5, "1.1 as recorded, 3 by the linear filter alone"
 
 
-def test_light_that_agrees_is_left_alone_below_nothing_too() -> None:
-    """A curve's zero of light is a convention: plain surfaces stay, whichever side of it they lie on."""
-    curve = ResponseCurve("five_segment", b=(0.12, 0.14), c=(0.62, 0.88), y_max=1.0)
-    assert curve.light_range[0] < -0.05
-    channels = [np.full((40, 60), light, np.float32) for light in (-0.05, 0.1, 0.3)]
-    path_px = np.linspace(-6, 6, 16)[:, None] * (1.0, 0.3)
+def _seen_along(path_px: NDArray[np.float64], curve: ResponseCurve) -> Any:
+    """What the light's corrections need of an 80 × 120 picture that was blurred along one path everywhere."""
 
     def field(centres_px: NDArray[np.float64]) -> KernelField:
         return KernelField(centres_px, np.repeat(path_px[None], len(centres_px), 0), 0.5)
 
     statistics = SimpleNamespace(noise_levels=1.0, colour_noise_levels=1.0)
-    blurred: Any = SimpleNamespace(
+    return SimpleNamespace(
         longest_px=12.0,
         curve=curve,
         statistics=statistics,
@@ -519,5 +515,29 @@ def test_light_that_agrees_is_left_alone_below_nothing_too() -> None:
         field=field,
         light=[np.zeros((80, 120), np.float32)],
     )
-    found = _consistent_light(blurred, luma_of(channels), channels, channels, 2, 2)
+
+
+def test_light_that_agrees_is_left_alone_below_nothing_too() -> None:
+    """A curve's zero of light is a convention: plain surfaces stay, whichever side of it they lie on."""
+    curve = ResponseCurve("five_segment", b=(0.12, 0.14), c=(0.62, 0.88), y_max=1.0)
+    assert curve.light_range[0] < -0.05
+    channels = [np.full((40, 60), light, np.float32) for light in (-0.05, 0.1, 0.3)]
+    blurred = _seen_along(np.linspace(-6, 6, 16)[:, None] * (1.0, 0.3), curve)
+    found = consistent_light(blurred, luma_of(channels), channels, channels, 2, 2)
     np.testing.assert_allclose(found, channels, atol=1e-4)
+    luma = np.full((80, 120), -0.05, np.float32)
+    np.testing.assert_allclose(without_negative_light(blurred, luma, 2, 2), luma, atol=1e-4)
+
+
+def test_waves_on_dark_ground_shrink_to_the_grounds_own_light() -> None:
+    """Waves as long as the path leave no trace in the record; cut off at 0, they would brighten the ground."""
+    blurred = _seen_along(np.linspace(-6, 6, 16)[:, None] * (1.0, 0.0), ResponseCurve("srgb"))
+    light = np.full((80, 120), 0.02, np.float32)
+    light[:, 60:] = 0.4 + 0.1 * np.sin(np.arange(60) * 2 * np.pi / 12)
+    light[:, :48] += 0.2 * np.sin(np.arange(48) * 2 * np.pi / 12)
+    found = without_negative_light(blurred, light, 2, 2)
+    assert found.min() >= 0
+    waves = found[:, 12:36]
+    assert abs(waves.mean() - 0.02) < 0.005, "0.07 where the negative light is only cut off"
+    assert waves.max() < 0.08, "0.22 before"
+    np.testing.assert_allclose(found[:, 72:], light[:, 72:], rtol=1e-3)  # nothing negative within reach: as it was

@@ -57,7 +57,8 @@ class FrameTranslation:
         """Centre (..., 3) at times (...) from the reference."""
         s = np.asarray(since_reference_s, float)[..., None]
         return np.asarray(
-            s * (self.velocity_m_s + s / 2 * (self.acceleration_m_s2 + s / 3 * (self.jerk_m_s3 + s / 4 * self.snap_m_s4)))
+            s
+            * (self.velocity_m_s + s / 2 * (self.acceleration_m_s2 + s / 3 * (self.jerk_m_s3 + s / 4 * self.snap_m_s4)))
         )
 
     def inverse_depth(self, rays: Array) -> Array:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 
 from virest.image_formation.blur import Image, TileGrid
-from virest.restoration.blurred import BlurredPicture, luma_of, with_vignetting
+from virest.restoration.blurred import BlurredPicture, block_means, luma_of, with_vignetting
 from virest.restoration.encoding import grey_levels
 from virest.restoration.neighbours.joint import HALF, NeighbourPicture
+from virest.restoration.positive_light import LIGHT_STEPS, consistent_light, without_negative_light
 from virest.restoration.row_chunks import RowRenderer
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.statistics.measure import STORED_COLOUR_PX
@@ -23,7 +23,6 @@ from virest.restoration.tile_layout import (
     in_tiles,
     join_neighbours,
     noise_to_signal,
-    sampled_kernels,
     tile_deconvolution,
 )
 
@@ -40,13 +39,6 @@ s²/6, against L²/12.  With shorter paths the coarse scale would lose detail.""
 DETAIL_SCATTER = 1.0
 """Standard deviation of the logarithm of a tile's power at 0.04 to 0.3 cycles per pixel, given its variance: 384 tiles
 of 256 px in 32 sharp frames of photographs, print and drawings."""
-LIGHT_STEPS = 2
-"""Number of corrections of the light.
-
-The first gains 0.2 to 0.3 dB in saturated scenes, the second 0.05 to 0.1, two more as much again (three simulated
-captures, 42 frames); where there is little colour, all gain 0.01 to 0.02.  With few iterations one is made."""
-LEAST_LIGHT = 1e-6
-"""Keeps divisors above 0; the darkest grey level is 3e-4."""
 NEARBY_SIDE, FINE_SIDE = 5, 3
 """Sides, in pixels of the colour differences, of the squares for their regression on the luma: for blurred pictures, in
 addition to the path on both sides, and for sharp ones."""
@@ -60,16 +52,17 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
     dark grey levels.
     """
     height, width = blurred.light[0].shape
-    coarse = settings.iterations <= FEW_ITERATIONS and blurred.longest_px > COARSE_COLOUR_BLUR_PX
-    scale = COARSE_COLOUR_SCALE if coarse else COLOUR_SCALE
+    few = settings.iterations <= FEW_ITERATIONS
+    scale = COARSE_COLOUR_SCALE if few and blurred.longest_px > COARSE_COLOUR_BLUR_PX else COLOUR_SCALE
+    steps = 1 if few else LIGHT_STEPS
+    sharp = without_negative_light(blurred, sharp, scale, steps)
     small, recorded = _shrunk(sharp, blurred, scale), _small_differences(blurred, scale)
     red_blue = _sharp_differences(blurred, recorded, small, settings, scale)
     seen, light = (
         [cv2.add(luma, difference) for difference in _three_differences(*differences)]
         for luma, differences in (recorded, (small, red_blue))
     )
-    steps = 1 if settings.iterations <= FEW_ITERATIONS else LIGHT_STEPS
-    channels = _consistent_light(blurred, small, seen, light, scale, steps)
+    channels = consistent_light(blurred, small, seen, light, scale, steps)
     small_grey, *differences = _grey_differences(blurred, small, channels)
     slopes = _regression_slopes(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
     rests = [cv2.subtract(d, cv2.multiply(s, small_grey)) for d, s in zip(differences, slopes, strict=True)]
@@ -167,7 +160,7 @@ def _noise_to_signal_factors(
 
 def _neighbour_differences(neighbour: NeighbourPicture, scale: int) -> tuple[Image, list[Image]]:
     """Luma of a neighbour's light, and red and blue minus it, at the size of the colour differences."""
-    red, green, blue = (_block_means(plane, scale // HALF) for plane in cv2.split(neighbour.half_light))
+    red, green, blue = (block_means(plane, scale // HALF) for plane in cv2.split(neighbour.half_light))
     luma = luma_of([red, green, blue])
     return luma, [cv2.subtract(plane, luma) for plane in (red, blue)]
 
@@ -192,7 +185,7 @@ def _shrunk(sharp: Image, blurred: BlurredPicture, scale: int) -> Image:
     """The luma at the size of the colour differences."""
     height, width = blurred.light[0].shape
     if sharp.shape == (height, width):
-        return _block_means(sharp, scale)
+        return block_means(sharp, scale)
     return cv2.resize(sharp, (-(-width // scale), -(-height // scale)), interpolation=cv2.INTER_LINEAR)
 
 
@@ -207,111 +200,16 @@ def _grey_differences(blurred: BlurredPicture, luma: Image, channels: Sequence[I
     return [grey, *(cv2.subtract(level, grey) for level in levels)]
 
 
-def _consistent_light(
-    blurred: BlurredPicture, luma: Image, recorded: list[Image], restored: list[Image], scale: int, steps: int
-) -> Sequence[Image]:
-    """Restored light of the channels, (height, width) each, made non-negative and consistent with what was recorded.
-
-    A linear filter rings around edges, and its negative light is cut off.  A channel that is nearly dark, as red is on
-    a green leaf, is then too bright, and the tone curve's steep slope shows the ringing as stripes.  Each of
-    Richardson–Lucy's steps corrects the light by the ratio of what was recorded to what it would record, and leaves
-    alone what agrees.  Light is counted from the curve's darkest, which may be below 0.  The noise of the recorded
-    light is added to both sides of the ratio; light that was not measured corrects nothing.  The luma, restored
-    with a better prior, stays as it is.  All are ``scale`` times smaller than the picture.
-    """
-    if blurred.longest_px < scale:
-        return restored
-    darkest = np.float32(min(blurred.curve.light_range[0], 0.0))
-    seen, light, luma = cv2.merge(recorded) - darkest, cv2.merge(restored) - darkest, luma - darkest
-    light = cv2.max(light, 0.0)
-    blur, unblur = _blur_along_paths(blurred, seen.shape[:2], scale)
-    noise = np.hypot(blurred.statistics.noise_levels, blurred.chroma.colour_noise_levels)
-    table = blurred.curve.linear_table()
-    least = float(table[int(np.clip(np.rint(noise), 1, 255))] - table[0])
-    measured = _measured(blurred, scale)
-    for _ in range(steps):
-        ratio = cv2.divide(seen + least, blur(light) + least)
-        if measured is not None:
-            ratio = 1 + measured * (ratio - 1)
-        light = cv2.multiply(light, unblur(ratio))
-    channels = cv2.split(light)
-    brighter = cv2.divide(cv2.max(luma, 0.0), cv2.max(luma_of(list(channels)), LEAST_LIGHT))
-    return [cv2.multiply(channel, brighter) + darkest for channel in channels]
-
-
-def _blur_along_paths(
-    blurred: BlurredPicture, shape: tuple[int, ...], scale: int
-) -> tuple[Callable[[Image], Image], Callable[[Image], Image]]:
-    """The blur of a picture (height, width, 3) of this size, ``scale`` times smaller, and the blur's transpose.
-
-    Instants are a pixel apart along the path; paths vary smoothly over the picture.
-    """
-    height, width = shape
-    _, _, recorded_px, recorded_sigma_px = sampled_kernels(blurred)
-    paths_px, sigma_px = (recorded_px / scale).astype(np.float32), float(recorded_sigma_px.mean()) / scale
-    count = int(np.clip(np.ceil(blurred.longest_px / scale), 2, paths_px.shape[2]))
-    instants = ((np.arange(count) + 0.5) / count * paths_px.shape[2]).astype(int).tolist()
-    own = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), -1)
-    moved = [cv2.resize(paths_px[:, :, k], (width, height), interpolation=cv2.INTER_LINEAR) for k in instants]
-
-    def gathered(picture: Image, sign: int) -> Image:
-        whole = np.zeros_like(picture)
-        for shift in moved:
-            source = cv2.scaleAdd(shift, float(sign), own)
-            cv2.accumulate(cv2.remap(picture, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), whole)
-        whole *= np.float32(1 / count)
-        return cv2.GaussianBlur(whole, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE) if sigma_px else whole
-
-    return lambda picture: gathered(picture, 1), lambda picture: gathered(picture, -1)
-
-
-def _measured(blurred: BlurredPicture, scale: int) -> Image | None:
-    """1.0 where all of a small pixel's light was measured, else 0.0, (height, width, 3); None: everywhere."""
-    if all(mask is None for mask in (*blurred.clipped, *blurred.dark)):
-        return None
-    shape = _block_means(blurred.light[0], scale).shape
-    known = []
-    for masks in zip(blurred.clipped, blurred.dark, strict=True):
-        unknown = [_block_means(mask, scale) for mask in masks if mask is not None]
-        known.append(np.float32(functools.reduce(cv2.add, unknown, np.zeros(shape, np.float32)) == 0))
-    return cv2.merge(known)
-
-
 def _small_differences(blurred: BlurredPicture, scale: int) -> tuple[Image, list[Image]]:
     """Luma, and red and blue minus it, ``scale`` times smaller; clipped pixels, without colour, are filled in."""
-    red, green, blue = (_block_means(plane, scale) for plane in blurred.light)
+    red, green, blue = (block_means(plane, scale) for plane in blurred.light)
     luma = luma_of([red, green, blue])
     differences = [cv2.subtract(plane, luma) for plane in (red, blue)]
     holes = blurred.holes
     if holes is None:
         return luma, differences
-    known = 1 - _block_means(cv2.dilate(holes, np.ones((3, 3), np.uint8)), scale)
+    known = 1 - block_means(cv2.dilate(holes, np.ones((3, 3), np.uint8)), scale)
     return luma, _filled_in(differences, known)
-
-
-def _block_means(plane: Image, side: int) -> Image:
-    """Means over blocks of ``side`` × ``side`` whole pixels, the last ones smaller.
-
-    Area interpolation with fractional ratios takes twice as long.  OpenCV is fastest with blocks of 2 × 2 pixels, so
-    larger even ones are built from these.
-    """
-    if side == 1:
-        return plane
-    if side > 2 and side % 2 == 0:
-        return _block_means(_block_means(plane, 2), side // 2)
-    height, width = plane.shape
-    means = np.empty((-(-height // side), -(-width // side)), np.float32)
-    for rows in _blocks(height, side):
-        for columns in _blocks(width, side):
-            part = means[rows.start // side : -(-rows.stop // side), columns.start // side : -(-columns.stop // side)]
-            part[:] = cv2.resize(plane[rows, columns], part.shape[::-1], interpolation=cv2.INTER_AREA)
-    return means
-
-
-def _blocks(length: int, side: int) -> list[slice]:
-    """The range of whole blocks, and the range of the rest, if not empty."""
-    whole = length - length % side
-    return [part for part in (slice(0, whole), slice(whole, length)) if part.stop > part.start]
 
 
 def _filled_in(planes: list[Image], known: Image) -> list[Image]:

@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from virest.restoration.neighbours.joint import _common_shift_px, _cubic_error, _shift_field, _trust, is_detailed
+from virest.restoration.neighbours.joint import (
+    _cubic_error,
+    _likeliest_field,
+    _shift_field,
+    _trust,
+    is_detailed,
+)
 from virest.restoration.neighbours.reduced_tiles import AROUND, TILE, WIDE, wide_spectra
 from virest.restoration.neighbours.registration import TileAgreement
 from virest.restoration.statistics.records import unknown_picture
@@ -17,20 +23,26 @@ SPACING_PX = 64.0
 CENTRES_PX = np.stack(np.meshgrid(np.arange(12), np.arange(9)), axis=-1).reshape(-1, 2) * SPACING_PX
 
 
+APART = np.linalg.norm(CENTRES_PX[:, None] - CENTRES_PX, axis=-1) / SPACING_PX
+
+
 def test_shifts_that_scatter_alone_are_no_error_of_the_field(rng: np.random.Generator) -> None:
     """Noise of tiles side by side is independent: no more of it is taken for the field's than chance makes."""
-    lasting = [_common_shift_px(CENTRES_PX, rng.normal(0, 0.2, CENTRES_PX.shape), 0.2, SPACING_PX) for _ in range(200)]
-    assert np.mean(np.square(lasting)) < 0.05 * 0.2**2
+    sure = np.ones(len(CENTRES_PX))
+    found = [_likeliest_field(rng.normal(0, 0.2, CENTRES_PX.shape), sure, APART)[0] for _ in range(40)]
+    assert np.mean(np.square(found)) < 0.05 * 0.2**2
 
 
-@pytest.mark.parametrize("noise_px", [0.0, 0.1])
-def test_a_smooth_rest_is_an_error_of_the_field(rng: np.random.Generator, noise_px: float) -> None:
-    """A rest that changes slowly over the picture comes back as its deviation on each axis, under noise too."""
-    waves = 0.2 * np.sin(2 * np.pi * CENTRES_PX / (9 * SPACING_PX))
-    off = waves + rng.normal(0, noise_px, waves.shape)
-    typical = float(np.median(np.linalg.norm(off, axis=1)) / 1.1774)
-    expected = float(np.sqrt(np.mean(waves**2)))
-    assert _common_shift_px(CENTRES_PX, off, typical, SPACING_PX) == pytest.approx(expected, rel=0.25)
+@pytest.mark.parametrize("noise_px", [0.03, 0.1])
+@pytest.mark.parametrize("wave_px", [0.2, 5.0])
+def test_a_smooth_rest_is_an_error_of_the_field(rng: np.random.Generator, wave_px: float, noise_px: float) -> None:
+    """A rest that changes slowly over the picture is told from the noise on it, even if it is far larger."""
+    off = wave_px * np.sin(2 * np.pi * CENTRES_PX / (9 * SPACING_PX))
+    off += rng.normal(0, noise_px, off.shape)
+    common_px, found_px, reach = _likeliest_field(off, np.ones(len(off)), APART)
+    assert common_px > wave_px / 2
+    assert reach > 1
+    assert 0.7 * noise_px < found_px < 2 * noise_px
 
 
 def _agreement(near_shift_px: float, rng: np.random.Generator) -> TileAgreement:

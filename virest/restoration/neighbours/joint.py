@@ -56,8 +56,9 @@ LEAST_SHIFTS = 6
 LOOKED_AT = 6
 """Number of kernels from which a neighbour's |K|² is estimated."""
 HUBER, ROBUST_STEPS = 1.5, 6
-REACHES, PARTS = (1.0, 2.0, 4.0), tuple(np.linspace(0.0, 0.95, 20).tolist())
-"""Tried reaches of the shifts' common part, in tiles' sides, and its parts of their power."""
+REACHES, PARTS = (1.0, 2.0, 4.0), tuple(np.sort(1 - np.geomspace(1.0, 1e-4, 17)).tolist())
+"""Tried reaches of the shifts' common part, in tiles' sides, and its parts of their power; the rest is noise, never
+0."""
 CUBIC = -0.75
 """Slope at one pixel of the kernel of OpenCV's cubic interpolation."""
 LONGEST_ROW = 2**14
