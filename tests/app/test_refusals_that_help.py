@@ -73,6 +73,9 @@ def test_a_movie_that_follows_no_gyroscope_has_to_be_recorded_again() -> None:
     advice = _advice(plan.refused(NoteCode.NOT_FOLLOWING, "the frames do not follow the gyroscope"))
     assert "stabilisation off" in advice
     assert "calibrate" not in advice
+    axes = _advice(plan.refused(NoteCode.OTHER_AXES, "the gyroscope's axes are not the profile's: virest calibrate"))
+    assert "virest calibrate" in axes
+    assert "stabilisation" not in axes
 
 
 def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:

@@ -62,6 +62,20 @@ def test_offset_and_bias_come_back(time_offset_s: float, direction: str) -> None
     assert not found.travels
 
 
+def test_a_gyroscope_mounted_another_way_is_named() -> None:
+    """Pictures and gyroscope belong together, but the profile's axes are another phone's: no recording is blamed."""
+    recorded = make(Setup(hand_motion(3), time_offset_s=0.011, frames=30, points=60))
+    turned = np.array(recorded.profile.r_cam_imu)[[1, 0, 2]] * [[1], [-1], [1]]
+    profile = replace(recorded.profile, time_offset_s=None, r_cam_imu=tuple(map(tuple, turned.tolist())))
+    found = estimate_time_offset(recorded.observed(profile), recorded.imu, profile)
+    assert not found.determined
+    assert found.other_axes
+    told = check_agreement(recorded.observed(profile), recorded.imu, replace(profile, time_offset_s=0.011))
+    assert not told.agrees
+    assert "virest calibrate finds them" in told.reason
+    assert not estimate(Setup(hand_motion(3), frames=30, points=60)).other_axes
+
+
 @pytest.mark.parametrize("error_s", [0.007, -0.012])
 def test_an_offset_a_little_wrong_agrees_but_not_best(error_s: float) -> None:
     """Pictures and gyroscope belong together, and where they agree clearly better is told, coarsely."""

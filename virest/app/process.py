@@ -344,6 +344,8 @@ def _advice(plan: RestorationPlan) -> str:
     """The command that would improve the result, if the profile is incomplete or contradicted by the frames."""
     if plan.refuses(NoteCode.NOT_FOLLOWING):
         return "record again with electronic stabilisation off; virest inspect CAPTURE lists what this recording holds"
+    if plan.refuses(NoteCode.OTHER_AXES):
+        return "run virest calibrate CAPTURE, which finds the axes, then process --config camera.yaml"
     if plan.contradicted is not None:
         return "the frames contradict the profile: run virest diagnose CAPTURE, then process --config extended.yaml"
     unknown = [

@@ -78,6 +78,8 @@ class OffsetEstimate:
     focal_std_px: float | None = None
     travels: bool = False
     """Whether the camera translates, so that only residuals across the parallax were used."""
+    other_axes: bool = False
+    """Whether the frames do follow the gyroscope, but with other axes than the profile's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,8 @@ def estimate_time_offset(
     if (doubt := coarse.doubt(len(observed.pairs), observed.lens.fx_px)) is not None:
         still = coarse.motion_rad * observed.lens.fx_px < MIN_MOTION_PX
         explained = float("nan") if still else coarse.explained
-        return OffsetEstimate(start_s, float("inf"), False, doubt[0], explained)
+        turned = "" if still or explained >= MIN_EXPLAINED else _with_other_axes(observed, imu, profile, search_s)
+        return OffsetEstimate(start_s, float("inf"), False, turned or doubt[0], explained, other_axes=bool(turned))
     lens = profile.intrinsics or observed.lens.scaled_focal(coarse.gain)
     start = replace(profile, time_offset_s=coarse.time_offset_s, intrinsics=lens)
     found = refine_time_offset(observed, imu, start, focal_known=not free_focal)
@@ -243,11 +246,20 @@ def check_agreement(
         better = _clearly_better(coarse.offset_s, coarse.explained_at, offset_s, 3 * len(observed.pairs))
         return Agreement(True, explained=explained, best_offset_s=better)
     elsewhere = None if coarse.doubt(len(observed.pairs), focal_px) else coarse.time_offset_s
-    hint = "was the movie stabilised in the camera, or is it from another recording?"
+    hint = _with_other_axes(observed, imu, profile, search_s)
+    hint = hint or "was the movie stabilised in the camera, or is it from another recording?"
     if elsewhere is not None:
         hint = f"at an offset of {elsewhere:+.3f} s it would explain {coarse.explained:.0%}"
     reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the frames' rotation: {hint}"
     return Agreement(False, reason, explained=explained, best_offset_s=elsewhere)
+
+
+def _with_other_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float) -> str:
+    """What the gyroscope explains with other axes than the profile's; empty: not enough either."""
+    coarse = align_coarsely(observed.turns(profile), imu, profile, search_s)
+    if coarse is None or not coarse.axes_changed or coarse.doubt(len(observed.pairs), observed.lens.fx_px):
+        return ""
+    return f"with other axes than the profile's it would explain {coarse.explained:.0%}: virest calibrate finds them"
 
 
 def _clearly_better(tried_s: Array, explained_at: Array, offset_s: float, figures: int) -> float | None:

@@ -401,6 +401,8 @@ def _with_estimates(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTr
         plan = plan.noted(NoteCode.TIME_OFFSET, f"time offset not determined ({estimate.reason})")
         if plan.refusal:
             return plan
+        if estimate.other_axes:
+            return plan.refused(NoteCode.OTHER_AXES, "the gyroscope's axes are not the profile's: virest calibrate")
         if estimate.explained < MIN_EXPLAINED:
             return plan.refused(NoteCode.NOT_FOLLOWING, "the frames do not follow the gyroscope")
         return plan.refused(NoteCode.TIME_OFFSET, "time offset not determined: virest calibrate")

@@ -15,6 +15,8 @@ class NoteCode(Enum):
     """The offset, missing in the profile, was estimated, or why it was not."""
     NOT_FOLLOWING = auto()
     """At no offset does the gyroscope explain half of the rotation: stabilised in the camera, or the wrong log."""
+    OTHER_AXES = auto()
+    """The gyroscope explains the rotation with other axes than the profile's."""
     OTHER_OFFSET = auto()
     """The frames contradict a stated offset."""
     FOCAL_LENGTH = auto()
