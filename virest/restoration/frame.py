@@ -383,7 +383,7 @@ def _details(
     gain_db = None
     if confirmed is not None:
         colour = measured.chroma.colour_error()
-        gain_db = confirmed.of_change_db(changed, model.blur_error, ideal, misplaced, colour)
+        gain_db = confirmed.of_change_db(changed, model.blur_error, ideal, model.sharp_power, misplaced, colour)
     return Deblurring(
         method=settings.deblur,
         preset=settings.preset,

@@ -85,8 +85,8 @@ def fit_workloads(scale: Scale) -> list[Workload]:
 def fit_left_over(rows: Sequence[Row]) -> Row:
     """Fit the coefficients of :data:`confirmation.LEFT_OVER` to the gains: values, standard deviations and scatter.
 
-    rows: with ``capture``, ``removed``, ``misplaced``, ``regressors`` (1, ln ideal, ln left, colour's) and
-    ``gain_db``.  Captures have equal weight.
+    rows: with ``capture``, ``removed``, ``misplaced``, ``regressors`` (of
+    :func:`confirmation.gain_regressors`) and ``gain_db``.  Captures have equal weight.
     """
     captures = np.array([row["capture"] for row in rows])
     names = list(dict.fromkeys(captures.tolist()))
@@ -121,18 +121,19 @@ def best_value(values: Sequence[float], gains_db: Array) -> Row:
 class _RecordingGain(ConfirmedGain):
     """A ConfirmedGain that records the arguments of its calls."""
 
-    asked: list[tuple[float, float, float, Misplaced, tuple[float, float]]] = field(default_factory=list)
+    asked: list[tuple[float, float, float, float, Misplaced, tuple[float, float]]] = field(default_factory=list)
 
     def of_change_db(
         self,
         changed: float,
         lost: float,
         ideal: float,
+        power: float,
         misplaced: Misplaced = confirmation.IN_PLACE,
         colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
-        self.asked.append((changed, lost, ideal, misplaced, colour))
-        return ConfirmedGain.of_change_db(self, changed, lost, ideal, misplaced, colour)
+        self.asked.append((changed, lost, ideal, power, misplaced, colour))
+        return ConfirmedGain.of_change_db(self, changed, lost, ideal, power, misplaced, colour)
 
 
 def _opened(work: Path, workload: Workload) -> TrueCapture:
@@ -163,7 +164,7 @@ def _promises(
         for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=recorder)):
             if restored.degradation is None or restored.degradation.deblur is None:
                 continue
-            changed, lost, ideal, misplaced, colour = recorder.asked[-1]
+            changed, lost, ideal, power, misplaced, colour = recorder.asked[-1]
             gone = confirmation.removed(changed, lost + colour[0])
             before_db, valid_px = straight_db[restored.frame.index]
             yield {
@@ -172,7 +173,7 @@ def _promises(
                 "frame": restored.frame.index,
                 "removed": gone,
                 "misplaced": np.stack((*misplaced.errors(gone), misplaced.weight)).tolist(),
-                "regressors": confirmation.gain_regressors(ideal, recorder.left, colour[1]).tolist(),
+                "regressors": confirmation.gain_regressors(ideal, power, recorder.left, colour[1]).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
             }
 

@@ -28,10 +28,11 @@ USUAL_SHARE, USUAL_SHARE_STD = 1.0, 0.5
 """Prior of the share: 1 for a correct restoration.  On 8 simulated captures, with exact profiles and with a phone's
 errors, it scattered by 0.3 between captures.  The prior is wider, so that wrong models are detected, while a few pairs
 that contradict each other still do not outweigh it."""
-LEFT_OVER = (3.84, 0.63, 0.35, 0.68)
-"""Coefficients of the remaining squared error, grey levels squared.  Of ln of luma's: a constant, and the slopes over
-ln of the spectra's ideal error and over ln of the part that neighbours do not find restored.  Then that of the colour
-differences' ideal error, which a regression on the restored luma undercuts.
+LEFT_OVER = (1.45, 0.69, 0.34, 0.77)
+"""Coefficients of the remaining squared error, grey levels squared.  Of ln of luma's over the sharp picture's power: a
+constant, and the slopes over ln of the spectra's ideal error over that power and over ln of the part that neighbours do
+not find restored; so a dimmer picture has as much less error.  Then that of the colour differences' ideal error, which
+a regression on the restored luma undercuts.
 
 Each predicts the error only to a factor.  ``python -m virest.app.bench --only fits`` fits the coefficients to pictures
 with ground truth: 3.41 ± 0.31, 0.64 ± 0.07, 0.28 ± 0.06, 0.55 ± 0.22 on 22 captures, median error 0.54 dB.  These are
@@ -73,19 +74,21 @@ class ConfirmedGain:
         changed: float,
         lost: float,
         ideal: float,
+        power: float,
         misplaced: Misplaced = IN_PLACE,
         colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
         """Gain, dB, of a restored picture, and its standard deviation.
 
         changed: mean square difference from the recorded picture; lost: that removed by the blur; ideal: an ideal
-        filter's error, the last two of luma, from the spectra, all in grey levels squared.  misplaced: error by
-        displaced rows.  colour: errors that an ideal filter removes from the colour differences, and that it leaves.
+        filter's error; power: the sharp picture's; the last three of luma, from the spectra, all in grey levels
+        squared.  misplaced: error by displaced rows.  colour: errors that an ideal filter removes from the colour
+        differences, and that it leaves.
         The deviation combines the uncertainty of the remaining error (LEFT_OVER_STD), of the removed error (the scatter
         of the share, and the disagreement of ``changed`` and ``lost``), and of the rows' displacement.
         """
         lost += colour[0]
-        left = float(remaining_error(gain_regressors(ideal, self.left, colour[1]), np.array(LEFT_OVER)))
+        left = float(remaining_error(gain_regressors(ideal, power, self.left, colour[1]), np.array(LEFT_OVER)))
         gone = removed(changed, lost)
         before, after = errors(left, gone, *misplaced.errors(gone))
         gains_db = 10 * np.log10(before / after)
@@ -111,14 +114,15 @@ def removed(changed: float, lost: float) -> float:
     return float(np.sqrt(changed * max(lost, 0.0)))
 
 
-def gain_regressors(ideal: float, left: float, colour: float) -> Array:
-    """(4,) the regressors of :data:`LEFT_OVER`."""
-    return np.array([*np.log(np.maximum((np.e, ideal, left), 1e-6)), colour])
+def gain_regressors(ideal: float, power: float, left: float, colour: float) -> Array:
+    """(5,) the regressors of :data:`LEFT_OVER`, and the sharp picture's power."""
+    return np.array([1.0, *np.log(np.maximum((ideal / power, left), 1e-6)), colour, power])
 
 
 def remaining_error(regressors: Array, coefficients: Array) -> Array:
-    """Squared error (...) that a restoration leaves, from regressors (..., 4) and :data:`LEFT_OVER`."""
-    return np.asarray(np.exp(regressors[..., :3] @ coefficients[:3]) + coefficients[3] * regressors[..., 3])
+    """Squared error (...) that a restoration leaves, from regressors (..., 5) and :data:`LEFT_OVER`."""
+    luma, colour = np.exp(regressors[..., :3] @ coefficients[:3]), coefficients[3] * regressors[..., 3]
+    return np.asarray(regressors[..., 4] * luma + colour)
 
 
 def _gain_db(part: float) -> float:

@@ -280,6 +280,11 @@ class PictureStatistics:
         return float(np.sqrt(PER_COLOUR_POWER * self._area() @ self.noise)) if self.measured else 0.0
 
     @property
+    def sharp_power(self) -> float:
+        """Mean square, grey levels squared, of the sharp picture's detail in the rings."""
+        return float(self._area() @ self.signal)
+
+    @property
     def blur_error(self) -> float:
         """Mean square error, grey levels squared, of the recorded picture by its blur."""
         return float(self._area() @ self._blur_loss())
