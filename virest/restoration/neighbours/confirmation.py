@@ -116,6 +116,7 @@ def removed(changed: float, lost: float) -> float:
 
 def gain_regressors(ideal: float, power: float, left: float, colour: float) -> Array:
     """(5,) the regressors of :data:`LEFT_OVER`, and the sharp picture's power."""
+    power = max(power, 1e-6)
     return np.array([1.0, *np.log(np.maximum((ideal / power, left), 1e-6)), colour, power])
 
 
