@@ -19,6 +19,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
 from virest.image_formation.row_motion import FrameTranslation, RowMotion, row_motion
+from virest.image_formation.warp import seen_by_rows
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
@@ -182,3 +183,8 @@ def psnr_db(picture: Array, truth: Array, border: int = 0) -> float:
     inner = (slice(border, -border or None),) * 2
     error = np.asarray(picture, float)[inner] - np.asarray(truth, float)[inner]
     return float(10 * np.log10(255.0**2 / np.mean(error**2)))
+
+
+def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
+    """Recorded positions of points of the picture at the reference time."""
+    return seen_by_rows(motion, points_px, motion.reference_s, anchor, inverse_depth)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.capture.video import GrayReader, probe_movie, read_gray
+from virest.capture.video import GrayReader, probe_movie
 from virest.diagnosis import local_blur
 from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.local_blur import (
@@ -26,7 +27,6 @@ from virest.diagnosis.local_blur import (
     frames_to_read,
     look_for_blur,
     look_for_steps,
-    observe_blur,
     residuals,
 )
 from virest.diagnosis.local_blur_edges import (
@@ -59,8 +59,10 @@ def observed(folder: Path, seed: int, *effects: str, bits_per_px: float = 0.5) -
     capture = read_capture(folder, look_at_pictures=False)
     profile = read_profile(folder / "camera.yaml")
     trajectory = integrate_gyro(capture.imu, profile)
-    pictures = read_gray(capture.movie, probe_movie(capture.movie), frames_to_read(capture, pairs=11))
-    return observe_blur(pictures, capture, profile, trajectory), profile, trajectory
+    gray = GrayReader(capture.movie, probe_movie(capture.movie))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(local_blur, "frames_to_read", partial(frames_to_read, pairs=11))
+        return look_for_blur(gray, capture, profile, trajectory), profile, trajectory
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +110,9 @@ def test_parts_of_a_capture_show_what_all_of_it_shows(
     monkeypatch.setattr(local_blur, "frames_to_read", lambda capture: [3, 5, 7, 8, 9, 12])
     capture, (_, profile, trajectory) = read_capture(nominal_folder, look_at_pictures=False), nominal
     gray = GrayReader(capture.movie, probe_movie(capture.movie))
-    whole = observe_blur(gray([3, 5, 7, 8, 9, 12]), capture, profile, trajectory)
     parts = look_for_blur(gray, capture, profile, trajectory)
+    monkeypatch.setattr(local_blur, "PARTS", 1)
+    whole = look_for_blur(gray, capture, profile, trajectory)
     np.testing.assert_array_equal(parts.edges.width_px, whole.edges.width_px)
     np.testing.assert_array_equal(parts.ratios.log_ratio, whole.ratios.log_ratio)
     assert parts.candidates == whole.candidates

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from laws import FISHEYE, RADTAN, UNDISTORTED, TurningCamera, phone
+from laws import FISHEYE, RADTAN, UNDISTORTED, TurningCamera, phone, recorded_points
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +17,6 @@ from virest.image_formation.warp import (
     corner_points,
     dense_map,
     moved_between,
-    recorded_points,
     seen_by_rows,
     straightened_points,
 )

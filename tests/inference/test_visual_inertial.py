@@ -8,12 +8,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from motion.swaying_camera import GRAVITY_M_S2, RUN, Sway, SwayingCamera, turned_aside
+from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.inference import visual_inertial
-from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
+from virest.inference.camera_travel import FrameMotion, Stretch, VisualInertialAlignment
 from virest.inference.visual_inertial import align, choose_runs
 
 SWAYS = {
@@ -74,11 +75,17 @@ def test_acceleration_over_a_frame_is_the_mean_one() -> None:
         np.testing.assert_allclose(motion.velocity_m_s + 0.027 * motion.acceleration_m_s2, expected, atol=0.04)
 
 
+def scene_stds(stretch: Stretch) -> list[NDArray[np.float64]]:
+    """Standard deviations of gravity, the accelerometer's bias and its delay."""
+    return np.split(np.sqrt(np.diag(stretch.fit.covariance)[len(stretch.fit.change) :][:7]), [3, 6])
+
+
 def test_gravity_less_the_bias_is_what_rests_on_the_accelerometer() -> None:
     """Apart the two are hardly told by so little turning, and the deviations say so; together they are."""
     camera, found = recorded(SWAYS["portrait"]), aligned(SWAYS["portrait"])
     stretch = found.stretches[0]
-    (gravity, gravity_std), (bias, bias_std) = stretch.gravity(), stretch.accel_bias()
+    gravity, bias = stretch.scene.gravity_m_s2, stretch.scene.accel_bias_m_s2
+    gravity_std, bias_std, _ = scene_stds(stretch)
     start = stretch.fit.integrated.trajectory.time_s[0]
     true_gravity = camera.orientation(start).inv().apply(GRAVITY_M_S2)
     assert np.all(np.abs(gravity - true_gravity) < 4 * gravity_std + 0.05)
@@ -93,8 +100,8 @@ def test_accelerations_a_sample_late_do_not_matter() -> None:
     """The delay is found, and velocity and scale stay what they were."""
     late = replace(SWAYS["portrait"], accel_delay_s=0.005)
     found = aligned(late)
-    delay_s, std_s = found.stretches[0].accel_delay()
-    assert delay_s == pytest.approx(0.005, abs=max(3 * std_s, 5e-4))
+    *_, std_s = scene_stds(found.stretches[0])
+    assert found.stretches[0].scene.accel_delay_s == pytest.approx(0.005, abs=max(3 * std_s[0], 5e-4))
     assert velocity_error(recorded(late), found) < 0.05
 
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.calibration.calibrated_values import (
     GLOBAL_SHUTTER,
@@ -56,7 +55,6 @@ from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 FEW_POINTS, MANY_POINTS = 2000, 7000
 EXPLAINED_SCALE = 1.15
 """Whitened residuals with a scale below this need no translation."""

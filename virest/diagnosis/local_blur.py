@@ -151,7 +151,7 @@ class BlurObservations:
 
 
 def frames_to_read(capture: Capture, pairs: int = 22) -> list[int]:
-    """Movie indices for :func:`observe_blur`: pairs of frames, evenly spaced over the capture."""
+    """Movie indices for :func:`look_for_blur`: pairs of frames, evenly spaced over the capture."""
     known = {f.index for f in capture.frames if f.exposure_s and (f.skip_reason is None or f.only_startup)}
     starts = [k for k in sorted(known) if k + PAIR_FRAMES in known]
     picked = np.linspace(0, len(starts) - 1, min(pairs, len(starts))).round().astype(int)
@@ -165,12 +165,16 @@ def look_for_blur(
     trajectory: Trajectory,
     each: ParallelMap = one_by_one,
 ) -> BlurObservations:
-    """Measure the frames of :func:`frames_to_read` part by part; the result is that of one stream."""
+    """Measure the frames of :func:`frames_to_read` part by part; the result is that of one stream.
+
+    Profile and trajectory only select the edges with little motion and the frequencies that motion leaves above the
+    noise.
+    """
     wanted, curve = frames_to_read(capture), profile.response or ResponseCurve("srgb")
     parts = _parts(wanted)
     early = [[k for k in wanted if part[0] - PAIR_FRAMES <= k < part[0]] if part else [] for part in parts]
     calls = [(gray, [*lead, *part], len(lead), capture.frames, curve) for lead, part in zip(early, parts, strict=True)]
-    seen = each(_measured_part, calls)
+    seen = each(_measured, calls)
     edges, pairs, steps = ([one for part in seen for one in part[kind]] for kind in range(3))
     found = _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
     return replace(found, steps=join_steps(steps))
@@ -199,38 +203,19 @@ def _steps_of_part(
     ]
 
 
-def _measured_part(
+def _measured(
     gray: Callable[[Sequence[int]], Stream], wanted: list[int], lead: int, frames: Sequence[Frame], curve: ResponseCurve
 ) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps]]:
-    return _measured(gray(wanted), frames, curve, EdgeSettings(), frozenset(wanted[:lead]))
+    """Edges, spectrum ratios and steps of frames in ascending order; the first ``lead`` only serve as first of a pair.
 
-
-def observe_blur(
-    pictures: Stream,
-    capture: Capture,
-    profile: CameraProfile,
-    trajectory: Trajectory,
-    settings: EdgeSettings | None = None,
-) -> BlurObservations:
-    """Measure a stream of (movie index, grey (h, w)), in ascending order, of the frames of :func:`frames_to_read`.
-
-    At most PAIR_FRAMES + 1 frames are in memory.  Profile and trajectory only select the edges with little motion and
-    the frequencies that motion leaves above the noise.
+    At most PAIR_FRAMES + 1 frames are in memory.
     """
-    curve = profile.response or ResponseCurve("srgb")
-    edges, pairs, _ = _measured(pictures, capture.frames, curve, settings or EdgeSettings(), frozenset())
-    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
-
-
-def _measured(
-    pictures: Stream, frames: Sequence[Frame], curve: ResponseCurve, settings: EdgeSettings, only_paired: frozenset[int]
-) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps]]:
-    """Edges, spectrum ratios and steps of all frames; frames in ``only_paired`` only serve as the first of a pair."""
+    settings, only_paired = EdgeSettings(), frozenset(wanted[:lead])
     edges: list[EdgeWidths] = []
     steps: list[IsolatedSteps] = []
     pairs: list[SpectrumRatios] = []
     kept: dict[int, SeenFrame] = {}
-    for index, picture in pictures:
+    for index, picture in gray(wanted):
         if picture is None or not frames[index].exposure_s:
             continue
         if index not in only_paired:

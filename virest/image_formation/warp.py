@@ -65,11 +65,6 @@ def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0
     return moved_between(motion, points_px, seen_s, motion.reference_s, inverse_depth)
 
 
-def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
-    """The inverse of :func:`straightened_points`: recorded positions of points of the picture at the reference time."""
-    return seen_by_rows(motion, points_px, motion.reference_s, anchor, inverse_depth)
-
-
 def seen_by_rows(
     motion: CameraMotion,
     points_px: Array,
@@ -99,7 +94,7 @@ def corner_points(width: int, height: int) -> Array:
 
 
 def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_depth: Any = None) -> NDArray[np.float32]:
-    """:func:`recorded_points` of every pixel, (height, width, 2), as cv2.remap expects it.
+    """Where the rows saw every pixel of the reference time, (height, width, 2), as cv2.remap expects it.
 
     Computed on a grid and interpolated; the map is smooth, so the error is below 0.01 px.
     """

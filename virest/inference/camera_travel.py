@@ -76,27 +76,6 @@ class Stretch:
         assert isinstance(self.fit.scene, InertialMotion)
         return self.fit.scene
 
-    def gravity(self) -> tuple[Array, Array]:
-        """Gravity (3,) in world axes, m/s², and its standard deviations."""
-        return self.scene.gravity_m_s2, self._std(slice(0, 3))
-
-    def accel_bias(self) -> tuple[Array, Array]:
-        """The accelerometer's bias (3,) in IMU axes, m/s², and its standard deviations."""
-        return self.scene.accel_bias_m_s2, self._std(slice(3, 6))
-
-    def accel_delay(self) -> tuple[float, float]:
-        """Seconds by which accelerations are older than their stamps, and the standard deviation."""
-        return self.scene.accel_delay_s, float(self._std(slice(6, 7))[0])
-
-    def _std(self, part: slice) -> Array:
-        return np.sqrt(np.maximum(np.diag(self.scene_covariance)[part], 0.0))
-
-    @property
-    def scene_covariance(self) -> Array:
-        """Of the scene's vector."""
-        terms = len(self.fit.change)
-        return self.fit.covariance[terms:, terms:]
-
     def origin_s(self, window: int) -> float:
         """Middle of a window, IMU clock."""
         return float(self.fit.profile.imu_time_s(self.table.origin_s[window]))
