@@ -14,13 +14,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app import api
 from virest.app.console import emit
 from virest.app.evaluation_captures import truth_frame
 from virest.app.outputs import write_whole
 from virest.app.simulate import simulate_command
+from virest.arrays import Picture
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture
 from virest.image_formation.blur import tile_grid
@@ -30,7 +30,6 @@ from virest.image_formation.row_motion import row_motion
 from virest.motion.integration import integrate_gyro
 from virest.report.concepts import axes_figure, blur_figure, rows_figure, strip_figure
 
-Picture = NDArray[np.uint8]
 COLOURS = 192
 """Colours of a palette picture, a third of the size; photographs keep full colour."""
 PHOTOGRAPHS = ("before_after", "joint", "blur_paths")

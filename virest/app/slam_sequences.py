@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from virest.app.jobs import Workers
 from virest.app.process import ProcessOptions, process_capture
 from virest.app.run_folder import read_lines
+from virest.arrays import Array
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.orb_slam import format_orb_slam
 from virest.camera.profile import CameraProfile
@@ -38,8 +39,6 @@ from virest.image_formation.row_motion import frame_times_s
 from virest.restoration.capture import at_true_times
 from virest.restoration.settings import RestorationSettings
 from virest.simulation.recording import truth_picture
-
-Array = NDArray[np.float64]
 
 KINDS = ("global", "rolling", "restored")
 PLACEHOLDERS = ("sequence", "trajectory", "settings", "times", "seed")

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.calibration.grey_levels import (
     CUT_SIGMA,
     ChannelEnds,
@@ -29,7 +30,6 @@ from virest.calibration.grey_levels import (
 )
 from virest.errors import CalibrationError
 
-Array = NDArray[np.float64]
 MAX_SHIFT_PX = 8.0
 MIN_GAIN = 0.2
 """Minimum fraction of the squared difference between two pictures that a shift must remove to be accepted."""
@@ -83,7 +83,7 @@ class BracketSamples:
     """(pictures, 2) shift of the scene, right and down, relative to the first picture."""
     ends: ChannelEnds
     """Black and white of each channel, before the channels were equalised."""
-    reliable: NDArray[np.bool_] | None = None
+    reliable: Mask | None = None
     """(samples, pictures) greys whose position between the limits is not decided by noise; None: not yet assessed."""
 
     @property
@@ -102,7 +102,7 @@ class BracketSamples:
         return self.lows[self.channel][:, None], self.highs[self.channel][:, None]
 
     @cached_property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Mask:
         """(samples, pictures): neither censored nor unreliable."""
         low, high = self.limits
         inside = (self.grey > low) & (self.grey < high)
@@ -239,10 +239,8 @@ def _plateau(means: Array, margin: float) -> float:
     return float(np.median(means[np.abs(means - peak) <= reach + 0.5]))
 
 
-def _flat_sites(
-    means: Array, variances: Array, measured: NDArray[np.bool_], noise: GreyNoise, pixels: int
-) -> NDArray[np.int64]:
-    """Indices of the flatter half of the sites, and of all with at most twice the noise variance.
+def _flat_sites(means: Array, variances: Array, measured: Mask, noise: GreyNoise, pixels: int) -> NDArray[np.int64]:
+    """Index of the flatter half of the sites, and of all with at most twice the noise variance.
 
     Flatness is the largest ratio of variance to expected noise over the greys that are not clipped.
     """

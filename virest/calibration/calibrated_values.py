@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.calibration.physical_limits import is_global, limit_reasons
 from virest.camera.profile import CameraProfile
 from virest.effects.changes import keep_readout, rotation_between
@@ -18,7 +18,6 @@ from virest.inference.chance import student_deviation
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.track_fit import TrackFit
 
-Array = NDArray[np.float64]
 MIN_STRETCHES = 2.5
 """A value must be supported by this effective number of time blocks; with fewer, nothing confirms it."""
 LARGE_CORRELATION = 0.9

@@ -20,11 +20,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.calibration.curve_families import Family
 
-Array = NDArray[np.float64]
 SHARED_LEVELS = 0.25
 EXPONENT_CHANGE = 0.4
 GREY_BINS = 16
@@ -58,7 +57,7 @@ def curve_posterior(
     slopes: Array,
     sigma: Array,
     grey: Array,
-    used: NDArray[np.bool_],
+    used: Mask,
     exposure_prior_ev: Array,
 ) -> CurvePosterior:
     """Gaussian posterior at a fit.
@@ -82,7 +81,7 @@ def curve_posterior(
     return CurvePosterior(std, np.sqrt(np.diag(covariance)[shape:]))
 
 
-def _shared_variance(grey: Array, residual: Array, used: NDArray[np.bool_]) -> tuple[float, Array]:
+def _shared_variance(grey: Array, residual: Array, used: Mask) -> tuple[float, Array]:
     """Variance of the error shared by greys of one picture and brightness, and the number of greys that share it.
 
     The variance is the mean square of the cells' mean residuals, minus the contribution of noise.

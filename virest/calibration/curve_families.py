@@ -10,14 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 
+from virest.arrays import Array
 from virest.calibration.exposure_check import FirstCurve
 from virest.camera.response import ResponseCurve
 
-Array = NDArray[np.float64]
 TABLE_KNOTS = 14
 TABLE_LEVELS = 96
 SMALLEST_LIGHT = 1e-7

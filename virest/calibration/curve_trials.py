@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from virest.arrays import Array, Mask
 from virest.calibration.bracket_samples import BracketSamples
 from virest.calibration.curve_certainty import CurvePosterior, curve_posterior, derivatives, inner_steps
 from virest.calibration.curve_families import Family, LogLookup, log_lookup, make_family
@@ -17,7 +18,6 @@ from virest.camera.response import KINDS, ResponseCurve
 from virest.errors import CalibrationError
 from virest.inference.robust import robust_std
 
-Array = NDArray[np.float64]
 TRUSTED_EV = 0.02
 """Prior standard deviation of a trusted listed exposure."""
 FREE_EV = 4.0
@@ -104,7 +104,7 @@ class Trial:
     curve: ResponseCurve
     parameters: Array
     correction_ev: Array
-    suspect: NDArray[np.bool_]
+    suspect: Mask
     score: Array
     """(held-out samples,) sum of capped squared normalised residuals."""
     site: NDArray[np.int64]
@@ -136,7 +136,7 @@ def require_possible(first: FirstCurve, samples: BracketSamples) -> None:
         )
 
 
-def optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDArray[np.bool_],
+def optimise(family: Family, start: Array, samples: BracketSamples, suspect: Mask,
               evaluations: int = 30) -> tuple[Array, Array]:  # fmt: skip
     """Curve parameters and exposure corrections (EV) of least cost, with a soft-L1 loss on the residuals."""
     samples, shape = samples.by_light(), len(family.start)
@@ -167,7 +167,7 @@ def optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDA
     return found.x[:shape], no_trend @ found.x[shape:]
 
 
-def _trend_rows(exposure: Array, suspect: NDArray[np.bool_]) -> Array:
+def _trend_rows(exposure: Array, suspect: Mask) -> Array:
     """Orthonormal rows (2, pictures): level and trend over log exposure of the corrections of trusted pictures.
 
     The level only sets the unit of light and is projected out.  So is the trend if the curve has a free exponent, since
@@ -203,7 +203,7 @@ def _from_best_start(family: Family, fit: BracketSamples, first: FirstCurve) -> 
 
 
 def scored_trial(
-    family: Family, parameters: Array, correction_ev: Array, suspect: NDArray[np.bool_], samples: BracketSamples
+    family: Family, parameters: Array, correction_ev: Array, suspect: Mask, samples: BracketSamples
 ) -> Trial:
     """Score a fitted curve on samples, usually held out."""
     curve = family.build(parameters)
@@ -248,7 +248,7 @@ def significantly_worse(one: Trial, other: Trial) -> bool:
     return bool(gain.mean() > Z_REJECTED * gain.std() / np.sqrt(len(gain)))
 
 
-def refit(trial: Trial, samples: BracketSamples, may_be_wrong: NDArray[np.bool_]) -> Trial:
+def refit(trial: Trial, samples: BracketSamples, may_be_wrong: Mask) -> Trial:
     """Fit again to all samples; pictures of ``may_be_wrong`` whose correction is now an outlier become suspect too."""
     start = np.concatenate([trial.parameters, trial.correction_ev])
     suspect = trial.suspect

@@ -16,12 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.calibration.bracket_samples import BracketSamples
 from virest.inference.robust import robust_std
 
-Array = NDArray[np.float64]
 KNOTS = 18
 SMOOTHNESS = 0.03
 """Weight of the curve's roughness relative to all data.
@@ -48,7 +47,7 @@ class FirstCurve:
     """(k,) natural logarithm of the exposure at these greys, 0 at the brightest."""
     correction_ev: Array
     """(pictures,) correction to add to log2 of each listed exposure."""
-    suspect: NDArray[np.bool_]
+    suspect: Mask
     """(pictures,) whether the listed exposure contradicts the others."""
 
 
@@ -166,7 +165,7 @@ def robust_line(x: Array, y: Array) -> tuple[float, float]:
     return found
 
 
-def outlying(ev: Array) -> NDArray[np.bool_]:
+def outlying(ev: Array) -> Mask:
     """Corrections more than CONTRADICTS_EV and ROBUST_Z robust standard deviations from the median.
 
     None with fewer than MIN_PICTURES pictures, or if half of the pictures or more would be outliers.

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.stats import chi2
 
+from virest.arrays import Array, Mask
 from virest.inference.robust import MEDIAN_TO_STD
 
-Array = NDArray[np.float64]
 DARKEST_JUDGED, BRIGHTEST_JUDGED = 4.0, 251.0
 """Range of greys in which a square's noise is mostly unclipped; beyond it, noise is clipped at 0 or 255."""
 BINS = 13
@@ -106,7 +106,7 @@ def mean_noise(noise: GreyNoise, pixels: int) -> GreyNoise:
     return replace(noise, variance=noise.variance / pixels + ROUNDING_LEVELS**2)
 
 
-def scatter_by_grey(residual: Array, grey: Array, channel: NDArray[np.int64], used: NDArray[np.bool_]) -> Array:
+def scatter_by_grey(residual: Array, grey: Array, channel: NDArray[np.int64], used: Mask) -> Array:
     """Robust variance (channels, bins) of residuals by grey; NaN for bins with too few.
 
     residual, grey, used: (samples, pictures) levels.  Each sample's light was fitted to its n greys, which reduces the
@@ -126,7 +126,7 @@ def scatter_by_grey(residual: Array, grey: Array, channel: NDArray[np.int64], us
     return found
 
 
-def reliably_inside(grey: Array, light: Array, limits: tuple[Array, Array], sigma: Array) -> NDArray[np.bool_]:
+def reliably_inside(grey: Array, light: Array, limits: tuple[Array, Array], sigma: Array) -> Mask:
     """Greys (samples, pictures) that lie between their limits because of their light and not of their noise.
 
     grey, sigma: (samples, pictures) levels and their standard deviation.  light: (samples, pictures) brightness of each

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import Field as ModelField
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.response import ResponseCurve
@@ -134,12 +134,12 @@ class CameraProfile:
         )
 
     @property
-    def rotation_cam_imu(self) -> NDArray[np.float64]:
+    def rotation_cam_imu(self) -> Array:
         """R_cam_imu, (3, 3)."""
         return np.array(self.r_cam_imu)
 
     @property
-    def pose_cam_imu(self) -> NDArray[np.float64]:
+    def pose_cam_imu(self) -> Array:
         """T_cam_imu, (4, 4): x_cam = T_cam_imu x_imu, metres."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.r_cam_imu, self.p_cam_imu_m

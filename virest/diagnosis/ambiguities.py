@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import STAMP_FRACTION
 from virest.diagnosis import picture_ladder
@@ -15,7 +15,6 @@ from virest.diagnosis.candidates import varies
 from virest.diagnosis.findings import Finding, ParameterChange, Rival
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 
-Array = NDArray[np.float64]
 COINCIDENCE_SIGMA, COINCIDENCE_PART = 3.5, 0.25
 """An offset is attributed to another timestamp reference if it agrees within this many standard deviations and within
 this part of the reference's own shift: a deviation that an unmodelled effect has widened agrees with everything."""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
 from virest.diagnosis.geometric_evidence import Evidence, Model, free_scene
@@ -16,7 +16,6 @@ from virest.inference.recorder_lag import Schedule
 from virest.inference.track_fit import Term
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
 SCREEN_POINTS = 1500
 """Points used to screen a cause."""
 CLOCKS = ("time_offset", "clock_skew")

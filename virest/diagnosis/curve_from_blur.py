@@ -28,12 +28,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.pixels import BT601_LUMA
 from virest.capture.records import Frame
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
-from virest.diagnosis.photometry import Array, Indices, Mask
 from virest.diagnosis.photometry_patches import GrayFrame, path_over_exposure, registered_points
 from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
 from virest.image_formation.turning_camera import TurningCamera, turning_camera
@@ -93,7 +93,7 @@ class MixingSettings:
 class MixingEvidence:
     """Evidence of each tile of each pair; scores are residuals projected on the effect of a curve change."""
 
-    pair: Indices
+    pair: Index
     """(n,) number of the pair of frames."""
     pixels: Array
     """(n,) weighted number of compared pixels, every second one along both axes."""
@@ -359,7 +359,7 @@ def _is_usable(usable: Mask) -> bool:
     return bool(usable.sum() >= 2 * _MIN_TILE_PIXELS and usable[::_EVERY, ::_EVERY].sum() >= _MIN_TILE_PIXELS)
 
 
-def _compared(usable: Mask, tile: tuple[slice, slice]) -> tuple[Indices, Indices]:
+def _compared(usable: Mask, tile: tuple[slice, slice]) -> tuple[Index, Index]:
     """Rows and columns, within a tile, of the pixels to compare."""
     row, column = np.nonzero(usable[tile][::_EVERY, ::_EVERY])
     return row * _EVERY, column * _EVERY

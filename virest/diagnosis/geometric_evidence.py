@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.calibration.physical_limits import impossible
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
@@ -37,8 +37,6 @@ __all__ = [
     "relief_loss",
 ]
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 CAP = 4.0
 """Residual cap, in median scales, so that single lost tracks do not dominate."""
 BLOCK_LENGTHS = (7, 11, 8, 13, 9)
@@ -71,7 +69,7 @@ class Evidence:
 
     imu: ImuSamples
     observed: ObservedTracks
-    block: NDArray[np.intp]
+    block: Index
     """(pairs,) number of the time block."""
     break_s: Array
     """Times (breaks,) at which the path from the accelerometer is unknown, camera clock."""

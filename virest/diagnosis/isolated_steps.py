@@ -6,14 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask, Picture
 from virest.capture.records import Frame
 from virest.inference.edges import parallel_profiles
 from virest.inference.unsharp_mask import MIN_STEP_LEVELS, UNCLIPPED_LEVELS
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 REACH_PX, STEP_PX = 9.0, 0.5
 PLATEAU_PX = 5.0
@@ -44,7 +41,7 @@ class IsolatedSteps:
     def __len__(self) -> int:
         return len(self.profile)
 
-    def chosen(self, rows: NDArray[np.bool_]) -> IsolatedSteps:
+    def chosen(self, rows: Mask) -> IsolatedSteps:
         """The steps at a mask."""
         return IsolatedSteps(*(getattr(self, f.name)[rows] for f in fields(self)))
 
@@ -74,7 +71,7 @@ def crossing(part: Array, level: float, along_px: Array) -> Array:
     return np.asarray(along_px[after - 1] + share * (along_px[1] - along_px[0]))
 
 
-def _isolated(levels: Array) -> tuple[Array, NDArray[np.intp]]:
+def _isolated(levels: Array) -> tuple[Array, Index]:
     """(profiles (n, m) on GRID_PX of the isolated steps, normalised by step height, middle at 0; their indices)."""
     low, high = UNCLIPPED_LEVELS
     kept = np.flatnonzero((levels.min(axis=1) > low) & (levels.max(axis=1) < high))

@@ -19,6 +19,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
@@ -54,8 +55,6 @@ from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 from virest.inference.time_blocks import even_blocks
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
 
 LENS_SIGMA_PX = 0.70
@@ -313,7 +312,7 @@ def _motion_px(edges: EdgeWidths, profile: CameraProfile, trajectory: Trajectory
     return np.sqrt(across(tensors, edges.normal))
 
 
-def time_blocks(time_s: Array, count: int = BLOCKS) -> NDArray[np.intp]:
+def time_blocks(time_s: Array, count: int = BLOCKS) -> Index:
     """Block (n,) of each residual; each block has the same number of distinct timestamps."""
     stamps = np.unique(time_s)
     return even_blocks(np.searchsorted(stamps, time_s), len(stamps), count)

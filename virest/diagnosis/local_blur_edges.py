@@ -24,12 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from virest.arrays import Array, Index, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
 from virest.inference.edges import TANGENT_PX, EdgeSettings, find_edges, sampled
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 STEP_PX = 0.5
 """Sample spacing of a profile."""
@@ -54,7 +52,7 @@ class EdgeWidths:
     Before :func:`isolated_edges`, one row for each edge and reach that holds it; afterwards, one row per isolated edge.
     """
 
-    frame: NDArray[np.intp]
+    frame: Index
     """(n,) movie index."""
     stamp_s: Array
     """(n,) the frame's timestamp, camera clock."""
@@ -64,7 +62,7 @@ class EdgeWidths:
     """(n, 2) middle of the edge."""
     normal: Array
     """(n, 2) unit normal, from dark to bright."""
-    number: NDArray[np.intp]
+    number: Index
     """(n,) index of the edge in its frame."""
     reach_px: Array
     """(n,) half length of the profile."""
@@ -192,7 +190,7 @@ def _levels_of(grey: Array, reach_px: Array) -> tuple[Array, Array, Array]:
 class WidthFit:
     """Steps fitted to profiles over every reach that holds them; width 0: the profile is not a step."""
 
-    row: NDArray[np.intp]
+    row: Index
     """(n,) index of the profile."""
     width_px: Array
     centre_px: Array

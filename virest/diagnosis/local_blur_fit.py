@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import BLUR, HeldOutGain
 from virest.diagnosis.local_blur import (
@@ -29,9 +29,6 @@ from virest.inference.descent import Residuals, Slopes, System, descend, slices,
 from virest.inference.robust import robust_std
 from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _EXPOSURE_SCALES = (0.05, 20.0)
 SHIFT_STD_S = 0.004

@@ -9,9 +9,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf
 
+from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.local_blur_edges import STEP_PX, fit_steps
 from virest.diagnosis.local_blur_spectra import MEMORY, SpectrumRatios, spectral_weights
@@ -22,7 +22,6 @@ from virest.image_formation.turning_camera import turning_camera
 from virest.image_formation.warp import seen_by_rows
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 _NODES = 4
 _INSTANTS = 5
 """Gauss-Legendre nodes of an exposure: exact for paths that are fourth-order polynomials in time."""
@@ -136,7 +135,7 @@ def covariates(
     }
 
 
-def _by_frame(stamp_s: Array) -> list[NDArray[np.intp]]:
+def _by_frame(stamp_s: Array) -> list[Index]:
     order = np.argsort(stamp_s, kind="stable")
     return [rows for rows in np.split(order, np.flatnonzero(np.diff(stamp_s[order])) + 1) if len(rows)]
 

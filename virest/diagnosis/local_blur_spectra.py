@@ -15,12 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
 from virest.restoration.statistics.tile_power import white_noise
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 SIDE_PX = 64
 MEMORY = 3
@@ -43,7 +41,7 @@ SIGNAL_TO_FLOOR = 8.0
 class SpectrumRatios:
     """One row per tile seen in two frames; (…, 2) holds the first and the second frame."""
 
-    frame: NDArray[np.intp]
+    frame: Index
     """(n, 2) movie indices."""
     stamp_s: Array
     """(n, 2, MEMORY) camera clock, of the frame itself and of those before it, newest first."""
@@ -59,13 +57,13 @@ class SpectrumRatios:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def select(self, keep: NDArray[np.bool_]) -> SpectrumRatios:
+    def select(self, keep: Mask) -> SpectrumRatios:
         """The rows at a mask."""
         return SpectrumRatios(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 @lru_cache(maxsize=1)
-def bins() -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+def bins() -> tuple[Array, Index, Index]:
     """(frequencies (m, 2) inside the rings, cycles per pixel; their indices in the flat spectrum; bins (m,))."""
     fx, fy = np.meshgrid(np.fft.rfftfreq(SIDE_PX), np.fft.fftfreq(SIDE_PX))
     radius = np.hypot(fx, fy)
@@ -110,7 +108,7 @@ def spectral_weights() -> tuple[Array, Array]:
     return unique / SIDE_PX, weights / weights.sum(axis=0)
 
 
-def ring_of_bin() -> NDArray[np.intp]:
+def ring_of_bin() -> Index:
     """(b,) ring of each bin."""
     return np.arange(bin_count()) // SECTORS
 
@@ -181,8 +179,8 @@ def _tracked_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
 
 
 def _tile_powers(
-    picture: Picture, middles: Array, table: NDArray[np.float32], clipped: NDArray[np.bool_]
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+    picture: Picture, middles: Array, table: NDArray[np.float32], clipped: Mask
+) -> tuple[Array, Array, Mask]:
     """(power (n, b) in linear light, mean grey (n,), mask of the tiles with clipped light)."""
     reach = SIDE_PX // 2
     cuts = [picture[int(y) - reach : int(y) + reach, int(x) - reach : int(x) + reach] for x, y in middles]

@@ -19,16 +19,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.image_formation.light import LEAST_LIGHT, flicker, light_maps, vignetting_at_radius
 from virest.image_formation.row_clock import ROW_MIDDLE, ROW_START, RowClock
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 _LOG_LIGHT = np.arange(-9.5, 0.75, 0.002)
 """Grid of the tabulated curve, natural logarithm of light."""
@@ -41,9 +37,9 @@ _LEAST_SLOPE = 0.02
 class PhotometricObservations:
     """Mean grey of patches, one entry for each patch, channel and frame that shows it; all arrays (n,)."""
 
-    patch: Indices
+    patch: Index
     """Patch and channel: 3 · place + channel.  Entries with the same number share one unknown light."""
-    frame: Indices
+    frame: Index
     """Movie index."""
     stamp_s: Array
     """The frame's timestamp, camera clock from stamp_0."""
@@ -76,12 +72,12 @@ class PhotometricObservations:
         return len(self.grey)
 
     @property
-    def place(self) -> Indices:
+    def place(self) -> Index:
         """(n,) number of the patch without its channel."""
         return self.patch // 3
 
     @property
-    def frames(self) -> Indices:
+    def frames(self) -> Index:
         """(k,) movie indices that occur, ascending."""
         return np.unique(self.frame)
 
@@ -220,7 +216,7 @@ def normalised_rms(observations: PhotometricObservations, profile: CameraProfile
     return float(np.sqrt(np.sum(left**2) / free.sum())), float(np.sqrt(np.mean(observations.noise**2)))
 
 
-def _patch_sum(patch: Indices, values: Array) -> Array:
+def _patch_sum(patch: Index, values: Array) -> Array:
     total = np.asarray(np.bincount(patch, values), np.float64)
     return np.maximum(total, 1e-12) if np.all(values >= 0) else total
 

@@ -7,9 +7,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
-from virest.diagnosis.photometry import Array, PhotometricObservations, predict
+from virest.diagnosis.photometry import PhotometricObservations, predict
 from virest.effects.changes import extended
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import ROW_MIDDLE

@@ -13,12 +13,10 @@ from itertools import islice, product
 
 import numpy as np
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import (
-    Array,
-    Indices,
-    Mask,
     PhotometricObservations,
     Prediction,
     normalised_rms,
@@ -100,7 +98,7 @@ class PhotometricFit:
         raise KeyError(effect_name)
 
 
-def time_blocks(observations: PhotometricObservations) -> Indices:
+def time_blocks(observations: PhotometricObservations) -> Index:
     """Block of each observation, (n,): contiguous frames, about BLOCKS_S long."""
     frames = observations.frames
     stamp = np.array([observations.stamp_s[np.argmax(observations.frame == k)] for k in frames])

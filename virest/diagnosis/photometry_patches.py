@@ -16,18 +16,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Picture
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
-from virest.diagnosis.photometry import Array, PhotometricObservations
+from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.photometry_noise import measured_noise
 from virest.image_formation.row_clock import ROW_MIDDLE, RowClock
 from virest.image_formation.turning_camera import TurningCamera, turning_camera
 from virest.image_formation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
 from virest.inference.tracking import TrackingSettings, find_corners
 from virest.motion.trajectory import Trajectory
-
-Picture = NDArray[np.uint8]
 
 _LK_WINDOW = (21, 21)
 _LK_LEVELS = 3

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Picture
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture, Frame
 from virest.diagnosis import local_blur, local_blur_fit
@@ -44,8 +44,6 @@ from virest.motion.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 MAX_RUNGS = 3
 WHOLE_LIGHT_FRAMES, MAX_LIGHT_FRAMES = 240, 130

@@ -18,10 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.findings import Finding
-from virest.diagnosis.photometry import Array, PhotometricObservations
+from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.photometry_effects import BlackLevel, PhotometricEffect, ResponseGamma
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, pulls, significance
 from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, frames_of, light_varies, sentence_of, values_of

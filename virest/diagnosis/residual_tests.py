@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.diagnosis import photometry, picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_verdict import GeometricVerdict
@@ -18,7 +18,6 @@ from virest.inference.robust import cauchy_weight, robust_std
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
 """Structure above this size, and above this fraction of the noise, has a cause."""
 STRUCTURE_P = 1e-4
@@ -90,7 +89,7 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, False)
 
 
-def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> tuple[float, float]:
+def _more_than_noise(distance: Array, pair: Index, noise: float) -> tuple[float, float]:
     """p values of the hypotheses that whitened distances are noise alone, and that the stray points are chance.
 
     One-sided t tests over the pairs: of their capped mean squares against 2 (SCALE_EXCESS noise)², and of their stray
@@ -105,7 +104,7 @@ def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> t
     return first, second
 
 
-def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Structure:
+def _along_time(difference: Array, weight: Array, pair: Index) -> Structure:
     """Structure over time: scatter of the pairs' mean residuals in excess of what the scatter of their points gives."""
     total = np.maximum(np.bincount(pair, weight), 1e-9)
     excess, chi2, freedom = 0.0, 0.0, 0

@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask, Picture
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.imu import ImuSamples
@@ -46,8 +47,6 @@ from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import PRESETS, RestorationSettings
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 Rectangle = tuple[int, int, int, int]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
@@ -332,7 +331,7 @@ def _tracked(
     return _Pair(pictures, valid_px, tracks if len(tracks) >= MIN_TRACKS else None)
 
 
-def _within(points_px: Array, rectangle: Rectangle) -> NDArray[np.bool_]:
+def _within(points_px: Array, rectangle: Rectangle) -> Mask:
     x0, y0, x1, y1 = rectangle
     low, high = np.array([x0, y0]) + EDGE_PX, np.array([x1, y1]) - 1 - EDGE_PX
     return np.all((points_px >= low) & (points_px <= high), axis=1)
@@ -350,7 +349,7 @@ def _overlap(rectangles: NDArray[np.int64]) -> Rectangle:
     return x0, y0, x1, y1
 
 
-def _inside(rectangle: Rectangle, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _inside(rectangle: Rectangle, shape: tuple[int, ...]) -> Picture:
     x0, y0, x1, y1 = rectangle
     mask = np.zeros(shape[:2], np.uint8)
     mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = 1

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
@@ -32,7 +33,6 @@ from virest.inference.track_fit import Term
 from virest.inference.track_noise import step_noise_px
 from virest.motion.integration import integrate_gyro
 
-Array = NDArray[np.float64]
 WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240
 """Captures of up to the first number of frames (15 s at 30 frames per second) are tracked in every frame; longer ones
 in runs of frames whose total length is the second number."""
@@ -120,7 +120,7 @@ class TrackedPoints:
         return found
 
 
-def _common_motion(difference_px: Array, group: NDArray[np.intp]) -> float:
+def _common_motion(difference_px: Array, group: Index) -> float:
     """Intraclass correlation of residuals (n, 2) within groups, here neighbours in one pair of frames.
 
     Badly tracked neighbours share nothing; points on one moving object share its motion.

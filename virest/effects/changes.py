@@ -7,15 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from virest.arrays import Array
 from virest.camera.gyro_filter import cutoff_hz, delay_s
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.errors import SettingsError
 
-Array = NDArray[np.float64]
 CUTOFFS_HZ = (0.02, 20.0)
 """Bounds of a stabiliser's cutoff while it is fitted."""
 

@@ -10,15 +10,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.gyro_filter import delay_s
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import READOUT_DIRECTIONS, STAMP_FRACTION
 from virest.effects import changes as by
 from virest.effects.records import BLUR, EDGES, GEOMETRY, PHOTOMETRY, Calibrated, Choice, Effect, Parameter, Steps
 
-Array = NDArray[np.float64]
 INF = float("inf")
 Read = Callable[[CameraProfile], Any]
 

@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from virest.arrays import Array
 from virest.camera.colmap import colmap_camera
 from virest.camera.intrinsics import Intrinsics
 from virest.errors import SettingsError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

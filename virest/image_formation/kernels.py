@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from virest.arrays import Array, Index
 from virest.image_formation.light import defocus_px, flicker
 from virest.image_formation.row_clock import ROW_END, ROW_START
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
 
-Array = NDArray[np.float64]
 SAMPLES_PER_PX = 2.0
 MIN_SAMPLES = 16
 NODE_STEP_S = 2e-3
@@ -69,7 +69,7 @@ class KernelField:
         kernels = splat_paths(self.paths_px, radius_px or self.radius_px, taps, self.light)
         return _defocused(kernels, self.defocus_sigma_px) if np.any(self.defocus_sigma_px) else kernels
 
-    def chosen(self, numbers: NDArray[np.intp]) -> KernelField:
+    def chosen(self, numbers: Index) -> KernelField:
         """The field of some of the tiles."""
         light = None if self.light is None else self.light[numbers]
         sigma_px = np.broadcast_to(self.defocus_sigma_px, len(self.paths_px))[numbers]
@@ -209,11 +209,11 @@ def _defocused(kernels: NDArray[np.float32], sigma_px: Array | float) -> NDArray
     return np.stack([k / s for k, s in zip(blurred, sums, strict=True)])
 
 
-def _linear_taps(part: Array) -> tuple[NDArray[np.intp], Array]:
+def _linear_taps(part: Array) -> tuple[Index, Array]:
     return np.arange(0, 2), np.stack([1 - part, part], -1)
 
 
-def _cubic_taps(part: Array) -> tuple[NDArray[np.intp], Array]:
+def _cubic_taps(part: Array) -> tuple[Index, Array]:
     rest = 1 - part
     weights = [
         -0.5 * part * rest**2,

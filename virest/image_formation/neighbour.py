@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation.kernels import KernelField, field_along, instants, splined_nodes
 from virest.image_formation.row_motion import FurtherTurn, RowMotion, covering_both, with_row_clock_of
 from virest.image_formation.warp import PIXELS_WITHIN_PX, grid_filled, seen_by_rows
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 STEP_RAD = 1e-5
 """Step of numerical slopes: about 0.01 px."""

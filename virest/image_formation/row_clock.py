@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 
-Array = NDArray[np.float64]
 ROW_START, ROW_MIDDLE, ROW_END = 0.0, 0.5, 1.0
 """Fractions of an exposure."""
 ROWS = np.linspace(0.0, 1.0, 41)

@@ -6,15 +6,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock, of_frame, row_time_s
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.relief_surface import Relief
 from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_from_rotation
 
-Array = NDArray[np.float64]
 STEP_S = 2e-4
 """Step of the tabulated motion: at 50 rad/s² linear interpolation errs by 2.5e-7 rad."""
 OUTSIDE_FRACTION = 0.25

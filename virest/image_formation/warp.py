@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from virest.arrays import Array
 from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 
-Array = NDArray[np.float64]
 FIXED_POINT_PX = 1e-5
 """The iteration over row times ends when points move less than this."""
 PIXELS_WITHIN_PX = 1e-3

@@ -22,16 +22,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, seen_s
 from virest.inference.guidance import applied_blur
 from virest.inference.tracking import TrackingSettings, shrink_factor
 from virest.motion.trajectory import turned
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 RELATIVE_STD = 0.35
 """Relative standard deviation of e, because textures differ."""
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, centre
 from virest.inference.depth import FrameDepth, TriangulatedPoints, frame_depth
 from virest.inference.profile_terms import GYRO_BIAS, TIME_OFFSET
@@ -16,7 +16,6 @@ from virest.inference.tracking_bias import SHARED_RELIEF
 from virest.motion.displacement import Displacement
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
 OFFSET_FLOOR_S = 3e-5
 """Systematic error of the time offset, added to its standard deviation."""
 ACCEL_SCALE_STD = 0.01

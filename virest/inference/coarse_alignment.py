@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.inference.frame_rotations import FrameRotations, gyro_turns
 from virest.motion.integration import integrate_gyro
 
-Array = NDArray[np.float64]
 STEP_S = 0.004
 MIN_COVERED = 0.75
 """Smallest fraction of the pairs that must lie inside the inertial data."""
@@ -191,7 +190,7 @@ def axis_maps() -> Array:
     return np.array(maps)
 
 
-def _best_rotations(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _best_rotations(seen: Array, gyro: Array, inside: Mask) -> tuple[Array, Array]:
     """Explained fraction (k,) and rotation (k, 3, 3) at each offset, reweighted once against outlying pairs."""
     weight = inside.astype(float)
     for _ in range(2):
@@ -210,22 +209,20 @@ def _best_rotations(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> tupl
     return explained, rotation
 
 
-def _gains(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> Array:
+def _gains(seen: Array, gyro: Array, inside: Mask) -> Array:
     """Gains (k,) of pitch and yaw, frames over gyroscope, both in camera axes."""
     used = inside[..., None]
     cross = (seen[:, :2] * gyro[..., :2] * used).sum(axis=(1, 2))
     return np.clip(cross / np.maximum((gyro[..., :2] ** 2 * used).sum(axis=(1, 2)), 1e-18), *GAINS)
 
 
-def _soft_weights(seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array) -> Array:
+def _soft_weights(seen: Array, gyro: Array, inside: Mask, rotation: Array) -> Array:
     squared = ((seen - gyro @ np.swapaxes(rotation, -1, -2)) ** 2).sum(axis=-1)
     scale = np.maximum(np.median(squared, axis=1, keepdims=True), 1e-14)
     return inside / (1 + squared / (SOFTENING**2 * scale))
 
 
-def _explained(
-    seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array, gain: Array | None = None
-) -> Array:
+def _explained(seen: Array, gyro: Array, inside: Mask, rotation: Array, gain: Array | None = None) -> Array:
     """1 − (residual power) / (power), saturated beyond the typical rotation, so that outlying pairs do not dominate."""
     predicted = gyro @ np.swapaxes(rotation, -1, -2)
     if gain is not None:

@@ -10,15 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, Poses, TrackTable, predict
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, cauchy_weight
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
 PASSES = 3
 RELIEF_PASSES, RELIEF_REACH = 6, 3.0
 FARTHEST = 0.02
@@ -43,7 +42,7 @@ LEAST_SPREAD = 0.02
 class TriangulatedPoints:
     """Points of the scene, each from one pair of frames."""
 
-    window: NDArray[np.intp]
+    window: Index
     """(n,)."""
     place_m: Array
     """(n, 3) world axes, relative to the camera centre at the window's middle."""
@@ -57,7 +56,7 @@ class TriangulatedPoints:
     def __len__(self) -> int:
         return len(self.window)
 
-    def chosen(self, use: NDArray[np.bool_]) -> TriangulatedPoints:
+    def chosen(self, use: Mask) -> TriangulatedPoints:
         """Some of the points."""
         return TriangulatedPoints(
             self.window[use], self.place_m[use], self.time_s[use], self.inverse_depth_per_m[use], self.std_per_m[use]
@@ -69,7 +68,7 @@ class Sightings:
     """Triangulated points with their first observation."""
 
     points: TriangulatedPoints
-    pair: NDArray[np.intp]
+    pair: Index
     """(n,) number of the pair of frames."""
     from_m: Array
     """(n, 3) camera centre, world axes, relative to its position at the window's middle."""
@@ -83,7 +82,7 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.pair)
 
-    def chosen(self, use: NDArray[np.bool_]) -> Sightings:
+    def chosen(self, use: Mask) -> Sightings:
         """Some of the points."""
         return Sightings(
             self.points.chosen(use), self.pair[use], self.from_m[use], self.rays[use], self.above_per_m[use],

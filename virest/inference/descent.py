@@ -20,11 +20,10 @@ from itertools import accumulate, pairwise
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
-Array = NDArray[np.float64]
 MAX_ITERATIONS = 15
 CONVERGED = 0.02
 """The fit ends when the rms of a step, in the values' standard deviations, is below this."""

@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Mask
 from virest.capture.imu import ImuSamples
 
-Mask = NDArray[np.bool_]
 STRAIGHT, CLIPPED = "straight", "clipped"
 STRAIGHT_PART = 0.03
 """Second differences below this fraction of their median count as those of a straight line."""

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
+from virest.arrays import Array, Index, Picture
 
 TANGENT_PX = (-2.0, -1.0, 0.0, 1.0, 2.0)
 """Offsets of the parallel profiles that are averaged: edges are straight over this length."""
@@ -49,7 +48,7 @@ def find_edges(picture: Picture, settings: EdgeSettings) -> tuple[Array, Array]:
     return here[kept].astype(float), normal[kept].astype(float)
 
 
-def _strongest_per_cell(points: Any, normal: Any, strength: Any, settings: EdgeSettings) -> NDArray[np.intp]:
+def _strongest_per_cell(points: Any, normal: Any, strength: Any, settings: EdgeSettings) -> Index:
     """Index of the strongest edge of each cell and direction, thinned evenly to ``edges_per_frame``."""
     direction = np.floor(np.arctan2(normal[:, 1], normal[:, 0]) % np.pi / (np.pi / 4)).astype(np.intp) % 4
     cell = (points // settings.cell_px).astype(np.intp)

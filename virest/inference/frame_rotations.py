@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.intrinsics import Intrinsics
 from virest.inference.tracking import TrackPair
 from virest.motion.trajectory import Trajectory, vector_from_rotation
 
-Array = NDArray[np.float64]
 REWEIGHTINGS = 8
 
 

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Picture
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.join import median_period_s
@@ -29,11 +30,10 @@ from virest.inference.frame_selection import choose_pairs
 from virest.inference.guidance import GyroGuide, gyro_guide
 from virest.inference.observed_tracks import frame_times
 from virest.inference.parallel import ParallelMap, one_by_one
-from virest.inference.tracking import Picture, TrackPair, track_frames
+from virest.inference.tracking import TrackPair, track_frames
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Reader = Callable[[Sequence[int]], Iterable[tuple[int, Picture | None]]]
 SAMPLE_FRAMES, RUN_FRAMES = 32, 8
 """Four runs of frames with the highest gyroscope motion."""
@@ -113,9 +113,9 @@ def _rotates_enough(frames: Sequence[Frame], capture: Capture, profile: CameraPr
 class _Scores:
     """Match scores of the first frames' tiles with the second frames, at every shift."""
 
-    first: NDArray[np.intp]
+    first: Index
     """(p,) movie index."""
-    second: NDArray[np.intp]
+    second: Index
     values: NDArray[np.float32]
     """(p, tiles, 2 r + 3, 2 r + 3) correlation at shifts (y, x) from -r - 1; 0 out of reach and for flat tiles."""
     centres_px: Array

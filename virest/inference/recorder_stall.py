@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.records import STALL, Capture
 from virest.image_formation.row_clock import RowClock
@@ -23,7 +24,6 @@ from virest.inference.tracking import TrackPair, track_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 CONTEXT = 8
 """Frames with correct timestamps on both sides of a stall, which determine the scatter of the rotations."""
 MIN_CONTEXT = 6

@@ -15,9 +15,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from virest.arrays import Array, Index, Mask
 from virest.image_formation.point_model import SMALLEST_DEPTH
 from virest.inference.depth import NEAR_S, OUTSIDE, Sightings
 from virest.inference.robust import CAUCHY
@@ -25,8 +25,6 @@ from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief, angles
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 LONG_CELLS, SHORT_CELLS = 24, 18
 """Cells along the picture's longer and shorter side."""
 ENOUGH_POINTS, MOST_POINTS, NEARBY = 500, 1500, 1 / 32
@@ -192,7 +190,7 @@ class PointsInFrame:
     variance: Array
     """(n,) from tracking noise, and from possible occlusion of points seen from another position."""
 
-    def chosen(self, use: NDArray[np.bool_]) -> PointsInFrame:
+    def chosen(self, use: Mask) -> PointsInFrame:
         """Some of the points."""
         return PointsInFrame(self.place[use], self.above_per_m[use], self.variance[use])
 
@@ -220,7 +218,7 @@ def points_in_frame(sights: Sightings, view: View, prior: ReliefPrior) -> Points
 
 
 def _seen_nearby(sights: Sightings, view: View, prior: ReliefPrior) -> Index:
-    """Indices of the points seen from nearby, chosen by pairs of frames, nearest first.
+    """Index of the points seen from nearby, chosen by pairs of frames, nearest first.
 
     Takes pairs until there are ENOUGH_POINTS, and further ones whose parallax of the sill is below NEARBY.
     """
@@ -359,7 +357,7 @@ def surface_gain(frames: list[PointsInFrame], prior: ReliefPrior) -> tuple[float
     return float(gain.sum() / max(before.sum(), 1e-30)), float(gain.sum()) / max(error, 1e-30)
 
 
-def _cells(place: Array, grid: Grid) -> tuple[Index, NDArray[np.bool_]]:
+def _cells(place: Array, grid: Grid) -> tuple[Index, Mask]:
     """Number of each position's cell, and its colour on a chessboard."""
     position = np.clip((place - grid.low) / grid.cell, 0.0, np.array([grid.columns, grid.rows]) - 1.000001)
     x, y = position.astype(np.intp).T

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
@@ -25,7 +25,6 @@ from virest.inference.tracking_bias import bias_std
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import settling_time_s
 
-Array = NDArray[np.float64]
 POINTS = 2500
 """Most tracked points used in the fit; more are thinned evenly."""
 IMU_MARGIN_S = 0.5

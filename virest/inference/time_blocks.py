@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+from virest.arrays import Array, Index, Mask
 
 
 def even_blocks(number: Index, total: int, blocks: int) -> Index:

@@ -23,18 +23,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
+from virest.arrays import Array, Picture
 from virest.image_formation.kernels import blur_chords
 from virest.image_formation.row_motion import RowMotion
 from virest.inference.chance import normal_tail
 from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
 from virest.inference.robust import robust_std
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 RADIUS_PX, RADIUS_SPREAD = 1.2, 0.3
 """Prior mean and standard deviation (of the logarithm) of the radius of phones' unsharp masks: 0.9 to 1.6 px."""

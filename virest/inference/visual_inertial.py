@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
@@ -30,7 +30,6 @@ from virest.inference.track_fit import GRAVITY_M_S2, Term, TrackFit, fit_tracks,
 from virest.motion.optics import settling_time_s
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
 STRETCH_S = 14.0
 """Length of stretches with common gravity and accelerometer bias; in this time a gyroscope drifts by a few mrad."""
 RUNS_PER_WINDOW, RUN_FRAMES = 4, 7
@@ -81,7 +80,7 @@ def choose_runs(frames: Sequence[Frame]) -> list[int]:
     return sorted(chosen)
 
 
-def _run(usable: Sequence[Frame], part: NDArray[np.intp]) -> list[int]:
+def _run(usable: Sequence[Frame], part: Index) -> list[int]:
     """The unbroken run closest to the middle of a part, or all of a short part."""
     if len(part) <= RUN_FRAMES:
         return [usable[int(k)].index for k in part]
@@ -256,7 +255,7 @@ def _judged(stretch: Stretch, rotating: TrackFit, window: int, depth_m: float | 
     return replace(found, reason=_no_metres(found), over_depth=found.flow_std < MAX_FLOW_STD)
 
 
-def _left(fit: TrackFit, mine: NDArray[np.bool_]) -> float:
+def _left(fit: TrackFit, mine: Mask) -> float:
     """Robust standard deviation per coordinate of a window's whitened residuals."""
     return float(np.median(fit.distance[mine])) / RAYLEIGH_MEDIAN
 

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Picture
 from virest.report.figures import as_file, canvas
 from virest.restoration.parameters import TileBlur
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 KERNEL_IN = 1.15
 """Side of a kernel in the figure, inches."""
 

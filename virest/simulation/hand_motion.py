@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from virest.arrays import Array
 
 FINE_STEP_S = 5e-4
 """Step of the simulator's fine time grids: 1/160 of the shortest period of the hand's motion, 12 Hz."""

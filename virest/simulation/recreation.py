@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.recounting import counted_from
 from virest.camera.response import ResponseCurve
@@ -28,8 +29,6 @@ from virest.simulation.recorded_motion import recorded_motion
 from virest.simulation.scenes import MAX_CHART_PX, Scene
 from virest.simulation.sensor import sensor_light
 from virest.simulation.session import ImuLog, Session, SessionSettings, shown_captures
-
-Array = NDArray[np.float64]
 
 NOT_RECREATABLE = frozenset({NO_IMU, IMU_GAP, NO_STAMP})
 """Skip codes of frames without a known time or motion; they cannot be recreated."""
