@@ -157,7 +157,7 @@ def _all_methods(capture: TrueCapture) -> Iterator[ComparedFrame]:
     """Each frame by the presets and by the baselines."""
     plan = capture.plan(RestorationSettings(deblur="none"))
     plans = {BLURRED: plan} | {f"virest {name}": replace(plan, settings=preset) for name, preset in PRESETS.items()}
-    curve = plan.profile.response or ResponseCurve("srgb")
+    curve = plan.profile.curve
     motions = capture.motions(plan)
     streams = zip(capture.recorded(), *(capture.restored(p) for p in plans.values()), strict=True)
     for (frame, recorded), *restored in streams:

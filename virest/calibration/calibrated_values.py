@@ -61,9 +61,8 @@ def global_shutter(fit: TrackFit, variances: dict[str, Array]) -> bool:
 
 def without_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
     """The profile with a readout of 0 and the given direction; the middle row keeps its time."""
-    bare = replace(given.shutter, readout_time_s=0.0, uneven=None)
-    kept = keep_readout(profile, replace(given, shutter=bare))
-    return replace(kept, shutter=replace(kept.shutter, uneven=None))
+    bare = given.with_shutter(readout_time_s=0.0, uneven=None)
+    return keep_readout(profile, bare).with_shutter(uneven=None)
 
 
 def beyond_limits(fit: TrackFit, observed: ObservedTracks, rolling: bool = True) -> dict[str, str]:

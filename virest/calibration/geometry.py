@@ -205,9 +205,9 @@ def _at_true_times(capture: Capture, observed: ObservedTracks, lag: StartUpLag) 
 
 
 def _with_lag(found: GeometryCalibration, lag: StartUpLag) -> GeometryCalibration:
-    extensions = replace(found.profile.extensions, frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
+    profile = found.profile.with_extensions(frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
     value = CalibratedValue("lag_s", 0.0, lag.lag_s, None, lag.determined, lag.note)
-    return replace(found, profile=replace(found.profile, extensions=extensions), values=(*found.values, value))
+    return replace(found, profile=profile, values=(*found.values, value))
 
 
 # ── coarse ───────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -313,10 +313,9 @@ def _readout_axis(imu: ImuSamples, table: TrackTable, start: CameraProfile, name
 
 def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
     """A global shutter at the time of the middle row: the start of a fit for a readout of either sign."""
-    shutter = profile.shutter
-    middle = (profile.time_offset_s or 0.0) + 0.5 * shutter.readout_time_s
-    bare = replace(shutter, readout_time_s=0.0, readout_direction=direction, uneven=None)
-    return replace(profile, time_offset_s=middle, shutter=bare)
+    middle = (profile.time_offset_s or 0.0) + 0.5 * profile.shutter.readout_time_s
+    bare = profile.with_shutter(readout_time_s=0.0, readout_direction=direction, uneven=None)
+    return replace(bare, time_offset_s=middle)
 
 
 def _with_uneven_rows(rough: _Rough, given: CameraProfile) -> _Rough:
@@ -328,7 +327,7 @@ def _with_uneven_rows(rough: _Rough, given: CameraProfile) -> _Rough:
         found = keep_readout(found, given)
     if found.shutter.readout_direction != given.shutter.readout_direction or not found.shutter.readout_time_s:
         return rough
-    return replace(rough, profile=replace(found, shutter=replace(found.shutter, uneven=uneven)))
+    return replace(rough, profile=found.with_shutter(uneven=uneven))
 
 
 def _uneven_note(fitted: CameraProfile, given: CameraProfile) -> tuple[str, ...]:

@@ -97,6 +97,23 @@ class CameraProfile:
     """Principal point and distortion if known without the focal length; its own focal length is nominal."""
 
     @property
+    def curve(self) -> ResponseCurve:
+        """The response curve; sRGB if it is unknown."""
+        return self.response or ResponseCurve("srgb")
+
+    def with_curve(self, **changes: Any) -> CameraProfile:
+        """The profile with values of its curve replaced."""
+        return replace(self, response=replace(self.curve, **changes))
+
+    def with_shutter(self, **changes: Any) -> CameraProfile:
+        """The profile with values of its shutter replaced."""
+        return replace(self, shutter=replace(self.shutter, **changes))
+
+    def with_extensions(self, **changes: Any) -> CameraProfile:
+        """The profile with values of its extensions replaced."""
+        return replace(self, extensions=replace(self.extensions, **changes))
+
+    @property
     def fields(self) -> tuple[ModelField, ...]:
         """All fields: the shutter's, the lens's and the extensions'."""
         lens = self.intrinsics
@@ -126,11 +143,13 @@ class CameraProfile:
         lens = self.intrinsics
         if lens is None and displaced is not None:
             raise SettingsError("extensions.field: a displacement needs a focal length", hint="set intrinsics.fx_px")
-        return replace(
-            self,
-            shutter=replace(self.shutter, uneven=uneven),
-            intrinsics=None if lens is None else replace(lens, displaced=displaced),
-            extensions=replace(self.extensions, field=tuple(held[""])),
+        return (
+            replace(
+                self,
+                intrinsics=None if lens is None else replace(lens, displaced=displaced),
+            )
+            .with_shutter(uneven=uneven)
+            .with_extensions(field=tuple(held[""]))
         )
 
     @property

@@ -152,7 +152,5 @@ def _depth_candidates(evidence: Evidence, model: Model, tried: set[str]) -> list
 
 
 def _lag_candidate(model: Model, lag_s: float, frames: int, by_frame: tuple[float, ...]) -> Candidate:
-    extensions = replace(model.profile.extensions, frame_lag_s=lag_s, frame_lag_frames=frames)
-    return Candidate(
-        "frame_lag", replace(model, profile=replace(model.profile, extensions=extensions), lag=by_frame), (), None
-    )
+    profile = model.profile.with_extensions(frame_lag_s=lag_s, frame_lag_frames=frames)
+    return Candidate("frame_lag", replace(model, profile=profile, lag=by_frame), (), None)

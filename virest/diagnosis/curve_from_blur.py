@@ -219,7 +219,7 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
     std = float(np.sqrt(jackknife + absolute**2 + (AGREEMENT / max(strength, 1e-6)) ** 2))
     p_value = 2 * student_tail(abs(change) / std, len(pairs) - 1)
     std = float(np.hypot(std, relative * change))
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     if effect_name == "response_curve":
         value = curve.extra_gamma * float(np.exp(change))
         return MixingEstimate(value, std * value, p_value, len(pairs))
@@ -315,7 +315,7 @@ def _compare(
     pixels = [_compared(usable, tiles[k]) for k in chosen]
     if not chosen:
         return []
-    curve = camera.profile.response or ResponseCurve("srgb")
+    curve = camera.profile.curve
 
     def light(seen: ResponseCurve) -> list[tuple[Plane, list[Plane]]]:
         """Light of both frames, aligned to the blurred one, each with the other's kernels."""

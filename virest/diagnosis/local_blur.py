@@ -169,7 +169,7 @@ def look_for_blur(
     Profile and trajectory only select the edges with little motion and the frequencies that motion leaves above the
     noise.
     """
-    wanted, curve = frames_to_read(capture), profile.response or ResponseCurve("srgb")
+    wanted, curve = frames_to_read(capture), profile.curve
     parts = _parts(wanted)
     early = [[k for k in wanted if part[0] - PAIR_FRAMES <= k < part[0]] if part else [] for part in parts]
     calls = [(gray, [*lead, *part], len(lead), capture.frames, curve) for lead, part in zip(early, parts, strict=True)]

@@ -86,8 +86,7 @@ class ExposureTime:
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set shutter.exposure_scale."""
-        scale = float(np.clip(values[0], *_EXPOSURE_SCALES))
-        return replace(profile, shutter=replace(profile.shutter, exposure_scale=scale))
+        return profile.with_shutter(exposure_scale=float(np.clip(values[0], *_EXPOSURE_SCALES)))
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
         """Whether there are enough tiles in frames with unequal motion."""
@@ -121,8 +120,7 @@ class Defocus:
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set extensions.defocus_sigma_px."""
-        sigma = float(np.clip(values[0], 0.0, 50.0))
-        return replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=sigma))
+        return profile.with_extensions(defocus_sigma_px=float(np.clip(values[0], 0.0, 50.0)))
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
         """Whether there are enough isolated steps."""

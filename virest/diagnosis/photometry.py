@@ -150,7 +150,7 @@ def predict(observations: PhotometricObservations, profile: CameraProfile, weigh
     weight: (n,) weights in that fit; 1 / noise² unless given.
     """
     weight = 1.0 / observations.noise**2 if weight is None else weight
-    tables = _tables(profile.response or ResponseCurve("srgb"))
+    tables = _tables(profile.curve)
     factor, kept = log_light_factor(observations, profile), _kept(observations)
     patch = observations.patch
     seen = np.interp(observations.grey, tables[0], _LOG_LIGHT) - factor

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.diagnosis.photometry import PhotometricObservations, predict
-from virest.effects.changes import extended
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import ROW_MIDDLE
 
@@ -86,10 +84,6 @@ class _OneValue:
         return [np.array(list(EFFECTS[self.name].read(profile, profile).values()))]
 
 
-def _bent(profile: CameraProfile, **changes: Any) -> CameraProfile:
-    return replace(profile, response=replace(profile.response or ResponseCurve("srgb"), **changes))
-
-
 @dataclass(frozen=True, slots=True)
 class ResponseGamma(_OneValue):
     """An additional gamma on the profile's curve."""
@@ -100,7 +94,7 @@ class ResponseGamma(_OneValue):
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set response.extra_gamma."""
-        return _bent(profile, extra_gamma=float(values[0]))
+        return profile.with_curve(extra_gamma=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +107,7 @@ class BlackLevel(_OneValue):
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set response.black_level."""
-        return _bent(profile, black_level=float(values[0]))
+        return profile.with_curve(black_level=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +120,7 @@ class Vignetting(_OneValue):
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set extensions.vignetting_corner_loss."""
-        return extended(profile, vignetting_corner_loss=float(values[0]))
+        return profile.with_extensions(vignetting_corner_loss=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,15 +143,14 @@ class Flicker:
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
         """The profile's flicker, and the highest peaks of the scan over frequency."""
         own = [_flicker_of(profile)] if profile.extensions.flicker_amplitude else []
-        scan = scan_flicker(observations, extended(profile, flicker_amplitude=0.0), self.search_hz)
+        scan = scan_flicker(observations, profile.with_extensions(flicker_amplitude=0.0), self.search_hz)
         return [*own, *(scan.start(i) for i in scan.peaks(self.candidates))] or [np.array([0.0, 100.0, 0.0])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set the flicker extensions; a negative amplitude is a positive one half a period later."""
         amplitude, frequency, phase = (float(v) for v in values)
         phase = float(np.mod(phase + (np.pi if amplitude < 0 else 0.0), 2 * np.pi))
-        return extended(
-            profile,
+        return profile.with_extensions(
             flicker_amplitude=abs(amplitude),
             flicker_frequency_hz=frequency,
             flicker_phase_rad=phase,
@@ -221,7 +214,7 @@ class GainDrift:
         """Set extensions.gain, with median 1 over the movie."""
         log_gain = np.interp(np.arange(self.movie_frames), self.frames, values)
         gain = np.exp(np.clip(log_gain - np.median(log_gain), -3.0, 3.0))
-        return extended(profile, gain=tuple((gain / np.median(gain)).tolist()))
+        return profile.with_extensions(gain=tuple((gain / np.median(gain)).tolist()))
 
 
 def photometric_effects(observations: PhotometricObservations, movie_frames: int) -> tuple[PhotometricEffect, ...]:

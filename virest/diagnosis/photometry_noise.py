@@ -29,16 +29,14 @@ _PASSES = 4
 _SOLVER_STEPS = 60
 
 
-def measured_noise(
-    observations: PhotometricObservations, curve: ResponseCurve | None = None
-) -> PhotometricObservations:
+def measured_noise(observations: PhotometricObservations, curve: ResponseCurve) -> PhotometricObservations:
     """The observations with their noise: a factor per frame times one per patch, from the residuals of the free fields.
 
     curve: the profile's; it removes the effect of logged exposure × ISO, so that a smooth field can model the rest.
     """
     if len(observations) == 0:
         return observations
-    left = _two_way_residual(observations, curve or ResponseCurve("srgb"))
+    left = _two_way_residual(observations, curve)
     frame = np.searchsorted(observations.frames, observations.frame)
     frame_noise = np.maximum(_robust_std(frame, left), _LEAST_LEVELS)[frame]
     ratio = np.clip(left / frame_noise, -6, 6) ** 2

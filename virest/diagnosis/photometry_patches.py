@@ -391,7 +391,7 @@ def _observations(
         width=width,
         height=height,
     )
-    return measured_noise(observations, profile.response)
+    return measured_noise(observations, profile.curve)
 
 
 def _logged_products(frames: list[Frame]) -> tuple[Array, Array, bool]:

@@ -380,7 +380,7 @@ def _light_ratios(profile: CameraProfile, pair: _Pair) -> Array:
     """Log ratio of the light at tracked points minus the pair's median, since exposure may change between frames."""
     if pair.tracks is None:
         return np.empty(0)
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     points = pair.tracks.points_first_px, pair.tracks.points_second_px
     a, b = (_patch_light(picture, curve, where) for picture, where in zip(pair.pictures, points, strict=True))
     low, high = (part * float(curve.linear_table().max()) for part in LIGHT_RANGE)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.candidates import FarStart
 from virest.diagnosis.field.bridging import Bridges, doubtful_pairs, with_bridges
@@ -154,19 +153,17 @@ def lighting_changes(profile: CameraProfile) -> bool:
 def with_flicker_of(profile: CameraProfile, lit: CameraProfile) -> CameraProfile:
     """The profile with the flicker of another: flicker shifts the mean time of each row's light."""
     light = lit.extensions
-    extensions = replace(
-        profile.extensions,
+    return profile.with_extensions(
         flicker_amplitude=light.flicker_amplitude,
         flicker_frequency_hz=light.flicker_frequency_hz,
         flicker_phase_rad=light.flicker_phase_rad,
     )
-    return replace(profile, extensions=extensions)
 
 
 def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Reader:
     """The same pictures without flicker and gain changes, for tracking."""
     by_index = {frame.index: frame for frame in frames}
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     height, width, shutter, clock = profile.height, profile.width, profile.shutter, RowClock(profile)
     along = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     rows_px = along[:1] if shutter.reads_columns else along[:, :1]

@@ -162,7 +162,7 @@ _POINTS = (
         "shutter.readout_direction",
         "the readout direction differs from the profile's",
         "the sensor is read {readout_direction}",
-        choice=Choice(READOUT_DIRECTIONS, lambda p, word: by.with_shutter(p, readout_direction=word)),
+        choice=Choice(READOUT_DIRECTIONS, lambda p, word: p.with_shutter(readout_direction=word)),
     ),
     Effect(
         "timestamp_reference",
@@ -171,7 +171,7 @@ _POINTS = (
         "shutter.timestamp",
         "the frame timestamps mark another instant of the exposure",
         "a frame's timestamp marks its {timestamp}",
-        choice=Choice(tuple(STAMP_FRACTION), lambda p, word: by.with_shutter(p, timestamp=word)),
+        choice=Choice(tuple(STAMP_FRACTION), lambda p, word: p.with_shutter(timestamp=word)),
     ),
     Effect(
         "exposure_time",
@@ -184,7 +184,7 @@ _POINTS = (
         calibrated=Calibrated(
             "exposure_scale",
             lambda p: p.shutter.exposure_scale,
-            lambda p, given: by.with_shutter(p, exposure_scale=given.shutter.exposure_scale),
+            lambda p, given: p.with_shutter(exposure_scale=given.shutter.exposure_scale),
             0.25,
             "exposure-scale",
             1.0,

@@ -63,7 +63,7 @@ def align_frames(
 ) -> AlignedFrames:
     """Align frames, given with their movie index, to the pixels of frame ``here``."""
     motion = motions[here]
-    curve = motion.profile.response or ResponseCurve("srgb")
+    curve = motion.profile.curve
     table = curve.linear_table()
     light = {}
     for number, picture in numbered:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.recounting import counted_from
-from virest.camera.response import ResponseCurve
 from virest.capture.join import TICKS_PER_S
 from virest.capture.records import IMU_GAP, NO_IMU, NO_STAMP, Capture, Frame
 from virest.errors import CaptureError, SettingsError
@@ -206,7 +205,7 @@ def _scene(
 ) -> Scene:
     """Chart at infinity from the picture's light, in the viewing direction at ``seen_s``; mirrored beyond valid_px."""
     profile = view.profile
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     factor = sensor_light(np.ones((profile.height, profile.width, 1), np.float32), profile, gain, defocus=False)
     light = curve.linearise(scene.picture.astype(np.float32) / 255).astype(np.float32) / np.maximum(
         factor, _LEAST_FACTOR

@@ -501,8 +501,4 @@ def _gyro_noise(session: Session, shape: tuple[int, ...], rng: np.random.Generat
 
 def _grey(session: Session, light: Array) -> Array:
     """Grey in [0, 1]: highlight roll-off, then the response curve."""
-    return grey_of_light(roll_off_highlights(light, session.settings.isp.highlights), _curve(session))
-
-
-def _curve(session: Session) -> ResponseCurve:
-    return session.true.response or ResponseCurve("srgb")
+    return grey_of_light(roll_off_highlights(light, session.settings.isp.highlights), session.true.curve)

@@ -31,7 +31,7 @@ def frame_motions(capture_folder: Path) -> tuple[ResponseCurve, dict[int, RowMot
     trajectory = integrate_gyro(capture.imu, profile)
     usable = [frame for frame in capture.frames if frame.skip_reason is None]
     motions = {f.index: row_motion(trajectory, profile, f.time_s, f.exposure_s) for f in usable}
-    return profile.response or ResponseCurve("srgb"), motions
+    return profile.curve, motions
 
 
 def peer_pictures(name: str, picture: Picture, motion: RowMotion, curve: ResponseCurve) -> Iterator[Picture]:
