@@ -87,7 +87,8 @@ class EdgeWidths:
 def join_edges(parts: Sequence[EdgeWidths]) -> EdgeWidths:
     """Concatenate the rows of several frames."""
     if not parts:
-        return _no_edges()
+        none, points, number = np.zeros(0), np.zeros((0, 2)), np.zeros(0, np.intp)
+        return EdgeWidths(number, none, none, points, points, number, none, none, none, none)
     names = [f.name for f in fields(EdgeWidths) if f.name != "candidates"]
     rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return EdgeWidths(**rows, candidates=sum(part.candidates for part in parts))
@@ -261,19 +262,3 @@ def _step_model(u: Array, profiles: Array, centre: Array, width: Array) -> tuple
     residual = profiles - mean_profile - b[:, None] * (shape - mean_shape)
     bell = np.sqrt(2 / np.pi) * np.exp(-0.5 * z**2) * (b / width)[:, None]
     return b, np.stack([np.ones_like(shape), shape, -bell, -bell * z], axis=1), residual
-
-
-def _no_edges() -> EdgeWidths:
-    empty = np.zeros(0)
-    return EdgeWidths(
-        np.zeros(0, np.intp),
-        empty,
-        empty,
-        np.zeros((0, 2)),
-        np.zeros((0, 2)),
-        np.zeros(0, np.intp),
-        empty,
-        empty,
-        empty,
-        empty,
-    )

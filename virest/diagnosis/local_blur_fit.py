@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -49,28 +48,6 @@ _LOW, _HIGH, _STEP = 0.02, 50.0, 0.02
 """Bounds of every effect's value, and its finite-difference step."""
 _NUISANCE_STEP = np.array([0.02, 5e-4])
 _DAMPING_STEP, _LEAST_STD_PX = 0.02, 1e-3
-
-
-class BlurEffect(Protocol):
-    """One cause that local blur can show."""
-
-    name: str
-    parameters: tuple[str, ...]
-
-    def starts(self, observations: BlurObservations, profile: CameraProfile) -> list[Array]:
-        """Starting values of a fit."""
-
-    def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """The profile with the effect's parameters set."""
-
-    def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
-        """Whether the capture determines the effect at all."""
-
-    def possible(self, values: Array) -> bool:
-        """Whether fitted values are an estimate rather than a bound of the fit."""
-
-    def shows_in(self, observations: BlurObservations) -> Mask:
-        """Mask of the residuals that determine the effect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +110,10 @@ class Defocus:
     def shows_in(self, observations: BlurObservations) -> Mask:
         """The edges: ratios of spectra between frames lack a blur that all frames share."""
         return observations.is_edge
+
+
+BlurEffect = ExposureTime | Defocus
+"""One cause that local blur can show."""
 
 
 @dataclass(frozen=True, slots=True)

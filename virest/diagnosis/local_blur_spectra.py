@@ -57,10 +57,6 @@ class SpectrumRatios:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def select(self, keep: Mask) -> SpectrumRatios:
-        """The rows at a mask."""
-        return SpectrumRatios(*(getattr(self, f.name)[keep] for f in fields(self)))
-
 
 @lru_cache(maxsize=1)
 def bins() -> tuple[Array, Index, Index]:

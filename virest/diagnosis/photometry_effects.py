@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,43 +20,6 @@ _SCAN_STEP_CYCLES = 0.3
 _LEAST_SINC = 0.03
 """Skip frequencies of which the exposure leaves less than this fraction: it lasts nearly a whole number of periods."""
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
-
-
-class PhotometricEffect(Protocol):
-    """One named effect on brightness."""
-
-    @property
-    def name(self) -> str:
-        """Name in the contract."""
-        ...
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of its values."""
-        ...
-
-    @property
-    def scale(self) -> Array:
-        """Typical change of each value."""
-        ...
-
-    @property
-    def per_frame(self) -> bool:
-        """Whether each value belongs to one frame only, so that other image regions must judge it, not other frames."""
-        ...
-
-    @property
-    def bounds(self) -> Bounds:
-        """Minimum and maximum of each value."""
-        ...
-
-    def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """Starting values of a fit, best first."""
-        ...
-
-    def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """The profile with these values in it."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +178,10 @@ class GainDrift:
         log_gain = np.interp(np.arange(self.movie_frames), self.frames, values)
         gain = np.exp(np.clip(log_gain - np.median(log_gain), -3.0, 3.0))
         return profile.with_extensions(gain=tuple((gain / np.median(gain)).tolist()))
+
+
+PhotometricEffect = ResponseGamma | BlackLevel | Vignetting | Flicker | GainDrift
+"""One named effect on brightness: its parameters, and their places in a profile."""
 
 
 def photometric_effects(observations: PhotometricObservations, movie_frames: int) -> tuple[PhotometricEffect, ...]:
