@@ -65,7 +65,7 @@ def without_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfi
     return keep_readout(profile, bare).with_shutter(uneven=None)
 
 
-def beyond_limits(fit: TrackFit, observed: ObservedTracks, rolling: bool = True) -> dict[str, str]:
+def beyond_limits(fit: TrackFit, observed: ObservedTracks, rolling: bool) -> dict[str, str]:
     """Fitted terms with physically impossible values, and the reason for each.
 
     rolling: whether the readout is a rolling shutter's; a global shutter's is possible.
@@ -78,7 +78,7 @@ def beyond_limits(fit: TrackFit, observed: ObservedTracks, rolling: bool = True)
     return {term.name: reasons[term.name] for term in fit.terms if term.name in reasons}
 
 
-def is_determined(fit: TrackFit, name: str, variance: Array, rolling: bool = True) -> bool:
+def is_determined(fit: TrackFit, name: str, variance: Array, rolling: bool) -> bool:
     """Whether a term is precise enough and supported by enough time blocks.
 
     A rolling shutter's readout within two standard deviations of 0 is not determined, since its direction is unknown.

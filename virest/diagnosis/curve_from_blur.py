@@ -62,6 +62,12 @@ CODING_STD = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
 AGREEMENT = 0.07
 """Correlation of coding residuals with a curve change, measured on movies of 0.1 to 0.4 bit per pixel with the
 profile's curve."""
+MOST_PAIRS, REACH_FRAMES = 16, 8
+"""Pairs of frames that are compared, and the most frames between a blurred frame and its sharp one."""
+BLURRED_PX, SHARP_PX, SHARP_PART = (3.5, 16.0), 3.0, 0.45
+"""Path lengths of blurred frames; the most of a sharp one, in px and as a part of the blurred one's."""
+TILE_PX, MOST_TILES = 80, 60
+"""Side of a tile, and tiles per pair, evenly spaced over the frame; more add no information."""
 READ_PARTS = 4
 """Number of parts in which frames are read in parallel."""
 _MIN_TILE_PIXELS = 400
@@ -72,21 +78,6 @@ _POSSIBLY_CLIPPED = ((np.arange(256) > 247) | (np.arange(256) < 4)).astype(np.ui
 """Mask of the 256 levels that may be clipped."""
 _MAX_CHROMA_RANGE = 40
 """Levels of Cr or Cb within a blur's reach."""
-
-
-@dataclass(frozen=True, slots=True)
-class MixingSettings:
-    """Which frames are compared. Lengths in pixels."""
-
-    pairs: int = 16
-    blurred_px: tuple[float, float] = (3.5, 16.0)
-    sharp_px: float = 3.0
-    sharp_part: float = 0.45
-    """The sharp frame's path is at most this part of the blurred one's."""
-    reach_frames: int = 8
-    tile_px: int = 80
-    tiles: int = 60
-    """Maximum number of tiles per pair, evenly spaced over the frame; more add no information."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,13 +151,11 @@ def observe_mixing(
     frames: Sequence[Frame],
     trajectory: Trajectory,
     profile: CameraProfile,
-    settings: MixingSettings | None = None,
     each: ParallelMap = one_by_one,
 ) -> MixingEvidence:
     """Compare blurred frames with sharp ones near them. Empty if the motion provides no such pairs."""
-    settings = settings or MixingSettings()
     camera = turning_camera(trajectory, profile) if profile.intrinsics is not None else None
-    pairs = _choose_pairs(frames, camera, settings) if camera is not None else []
+    pairs = _choose_pairs(frames, camera) if camera is not None else []
     wanted = sorted({k for pair in pairs for k in pair})
     runs = [part.tolist() for part in np.array_split(np.array(wanted, np.intp), READ_PARTS)]
     read = each(_read_part, [(read_rgb, run) for run in runs if run])
@@ -175,7 +164,7 @@ def observe_mixing(
     darkest = _darkest(list(pictures.values()))
     steps = _steps(darkest)
     known = [number for number, pair in enumerate(pairs) if pair[0] in pictures and pair[1] in pictures]
-    calls = [(*((by_index[k], pictures[k]) for k in pairs[number]), camera, settings, steps) for number in known]
+    calls = [(*((by_index[k], pictures[k]) for k in pairs[number]), camera, steps) for number in known]
     compared = each(_compare, calls)
     rows = [(number, row) for number, found in zip(known, compared, strict=True) for row in found]
     table = np.array([row for _, row in rows]).reshape(-1, 12)
@@ -260,19 +249,19 @@ def _root(evidence: MixingEvidence, effect_name: str) -> float:
 # ── pairs of frames ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _choose_pairs(frames: Sequence[Frame], camera: TurningCamera, settings: MixingSettings) -> list[tuple[int, int]]:
+def _choose_pairs(frames: Sequence[Frame], camera: TurningCamera) -> list[tuple[int, int]]:
     """(sharp, blurred) movie indices with the most blur between them."""
     if any(frame.exposure_s is None for frame in frames) or len(frames) < 2:
         return []
     length = _central_blur_px(frames, camera)
     index = np.array([frame.index for frame in frames])
     found = []
-    for i in np.flatnonzero((length > settings.blurred_px[0]) & (length < settings.blurred_px[1])):
-        near = np.flatnonzero(np.abs(index - index[i]) <= settings.reach_frames)
+    for i in np.flatnonzero((length > BLURRED_PX[0]) & (length < BLURRED_PX[1])):
+        near = np.flatnonzero(np.abs(index - index[i]) <= REACH_FRAMES)
         best = near[np.argmin(length[near])]
-        if length[best] < min(settings.sharp_px, settings.sharp_part * length[i]):
+        if length[best] < min(SHARP_PX, SHARP_PART * length[i]):
             found.append((float(length[i] - 1.5 * length[best]), int(index[best]), int(index[i])))
-    return [(sharp, blurred) for _, sharp, blurred in sorted(found, reverse=True)[: settings.pairs]]
+    return [(sharp, blurred) for _, sharp, blurred in sorted(found, reverse=True)[:MOST_PAIRS]]
 
 
 def _central_blur_px(frames: Sequence[Frame], camera: TurningCamera) -> Array:
@@ -294,7 +283,6 @@ def _compare(
     sharp: tuple[Frame, Rgb],
     blurred: tuple[Frame, Rgb],
     camera: TurningCamera,
-    settings: MixingSettings,
     steps: dict[str, Array],
 ) -> list[Array]:
     """Pixels, noise, and for each effect stiffness, scores and rest, (12,) in all, of each usable tile of one pair."""
@@ -306,12 +294,12 @@ def _compare(
     x, y = ((np.arange(n) / _NODE_PX).astype(np.float32) for n in (width, height))
     place = cv2.remap(where, np.tile(x, (height, 1)), np.tile(y[:, None], (1, width)), cv2.INTER_LINEAR)
     usable = _usable(sharp[1], blurred[1], place)
-    tiles = _tiles(width, height, settings.tile_px)
+    tiles = _tiles(width, height, TILE_PX)
     middles = np.array([((t[1].start + t[1].stop) / 2, (t[0].start + t[0].stop) / 2) for t in tiles])
     kernels = [
         [_kernel(path) for path in path_over_exposure(middles, frame, camera)] for frame in (sharp[0], blurred[0])
     ]
-    chosen = _evenly_chosen([k for k, tile in enumerate(tiles) if _is_usable(usable[tile])], settings.tiles)
+    chosen = _evenly_chosen([k for k, tile in enumerate(tiles) if _is_usable(usable[tile])], MOST_TILES)
     pixels = [_compared(usable, tiles[k]) for k in chosen]
     if not chosen:
         return []

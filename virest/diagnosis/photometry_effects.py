@@ -15,6 +15,10 @@ from virest.image_formation.row_clock import ROW_MIDDLE
 
 _SCAN_OBSERVATIONS = 7_000
 """Enough to find a frequency; larger temporary arrays are reallocated each time, which is ten times slower."""
+SEARCH_HZ = (20.0, 400.0)
+"""Frequencies of the scan: lamps pulse at 100 or 120 Hz and their multiples, or are dimmed at lower rates."""
+_CANDIDATES = 4
+"""Number of scan peaks from which fits start: aliases look alike until they are refined."""
 _SCAN_STEP_CYCLES = 0.3
 """Frequency step of the scan times the length of the capture, cycles."""
 _LEAST_SINC = 0.03
@@ -94,9 +98,6 @@ class Flicker:
     parameters: tuple[str, ...] = ("amplitude", "frequency_hz", "phase_rad")
     per_frame: bool = False
     bounds: Bounds = ((-0.95, 1.0, -np.inf), (0.95, np.inf, np.inf))
-    search_hz: tuple[float, float] = (20.0, 400.0)
-    candidates: int = 4
-    """Number of scan peaks from which fits start: aliases look alike until they are refined."""
 
     @property
     def scale(self) -> Array:
@@ -106,8 +107,8 @@ class Flicker:
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
         """The profile's flicker, and the highest peaks of the scan over frequency."""
         own = [_flicker_of(profile)] if profile.extensions.flicker_amplitude else []
-        scan = scan_flicker(observations, profile.with_extensions(flicker_amplitude=0.0), self.search_hz)
-        return [*own, *(scan.start(i) for i in scan.peaks(self.candidates))] or [np.array([0.0, 100.0, 0.0])]
+        scan = scan_flicker(observations, profile.with_extensions(flicker_amplitude=0.0))
+        return [*own, *(scan.start(i) for i in scan.peaks(_CANDIDATES))] or [np.array([0.0, 100.0, 0.0])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set the flicker extensions; a negative amplitude is a positive one half a period later."""
@@ -217,9 +218,7 @@ class FlickerScan:
         return np.array([min(found[0], 0.6), *found[1:]])
 
 
-def scan_flicker(
-    observations: PhotometricObservations, profile: CameraProfile, search_hz: tuple[float, float]
-) -> FlickerScan:
+def scan_flicker(observations: PhotometricObservations, profile: CameraProfile) -> FlickerScan:
     """Fit a sine at each frequency to the residuals in log light by least squares, with the patches' light refitted."""
     weight = 1 / observations.noise**2
     prediction = predict(observations, profile)
@@ -232,7 +231,7 @@ def scan_flicker(
     exposure = np.asarray(profile.shutter.true_exposure_s(observations.exposure_s), float)
     time_s = observations.row_time_s(profile, ROW_MIDDLE)[keep]
     span = max(float(np.ptp(time_s)), 0.1)
-    frequency = np.arange(search_hz[0], search_hz[1], _SCAN_STEP_CYCLES / span)
+    frequency = np.arange(*SEARCH_HZ, _SCAN_STEP_CYCLES / span)
     coefficients, power = _sines(observations.patch[keep], relative[keep], stiffness[keep], time_s, frequency)
     left = np.sinc(frequency * np.median(exposure))
     whole = np.where(np.abs(left) > _LEAST_SINC, left, np.inf)

@@ -22,7 +22,7 @@ from virest.diagnosis.photometry import (
     normalised_rms,
     predict,
 )
-from virest.diagnosis.photometry_effects import GainDrift, PhotometricEffect, flicker_change
+from virest.diagnosis.photometry_effects import SEARCH_HZ, GainDrift, PhotometricEffect, flicker_change
 from virest.effects.table import EFFECTS
 from virest.inference.chance import chi2_tail, normal_deviate
 from virest.inference.clustered import raised, scatter
@@ -193,7 +193,7 @@ def significance(
     elif effect_name == "flicker":
         z2 = values[0] ** 2 / covariance[0, 0]
         span_s = float(np.ptp(observations.stamp_s))
-        trials = max(380.0 * span_s, 1.0)
+        trials = max(np.ptp(SEARCH_HZ) * span_s, 1.0)
         p = float(-np.expm1(trials * np.log1p(-min(np.exp(-0.5 * z2), 1 - 1e-12))))
     elif effect_name == "gain_drift":
         (gains,) = (effect for effect in fit.effects if isinstance(effect, GainDrift))
@@ -215,7 +215,7 @@ def _p_of_gains(observations: PhotometricObservations, log_gain: Array, before: 
     """
     product = _per_frame(observations, observations.log_product)
     rounding = _per_frame(observations, observations.log_product_std)
-    late = product - _frames_before(product, 1)
+    late = _since_frame_before(product)
     followed = np.stack([CURVE_ERROR * product, CURVE_ERROR * product**2, DELAY_FRAMES * late], axis=-1)
     spread = covariance + followed @ followed.T + np.diag(rounding**2)
     change = log_gain - before
@@ -239,14 +239,14 @@ def _quick_changes(log_gain: Array, spread: Array) -> float:
 
 def _lag_of_gains(log_gain: Array, exposed: Array) -> Array:
     """Covariance added by the encoder's lag behind changes of the gains themselves; zero without gains."""
-    own = np.abs(log_gain - _frames_before(log_gain, 1))
+    own = np.abs(_since_frame_before(log_gain))
     centre = np.eye(len(own)) - 1 / len(own)
     return np.asarray(centre @ np.diag(LAG_ERROR**2 * ((own + exposed) ** 2 - exposed**2)) @ centre)
 
 
-def _frames_before(values: Array, frames: int) -> Array:
-    """The values (n,) a number of frames earlier; the first value is repeated at the start."""
-    return np.concatenate([np.repeat(values[:1], frames), values])[: len(values)]
+def _since_frame_before(values: Array) -> Array:
+    """Changes (n,) of values per frame since the frame before; 0 for the first."""
+    return np.diff(values, prepend=values[:1])
 
 
 def _per_frame(observations: PhotometricObservations, values: Array) -> Array:
@@ -433,7 +433,7 @@ def _changes(observations: PhotometricObservations, effects: Sequence[Photometri
     for effect, own in _parts(effects):
         if isinstance(effect, GainDrift):
             exposed = _exposure_steps(observations, effect.frames)
-            changes[own] = np.abs(values[own] - _frames_before(values[own], 1)) + exposed
+            changes[own] = np.abs(_since_frame_before(values[own])) + exposed
     return changes
 
 
@@ -441,7 +441,7 @@ def _exposure_steps(observations: PhotometricObservations, frames: Sequence[int]
     """Absolute change (k,) of log exposure × ISO at each of some observed frames since the last; 0 for the first."""
     seen = observations.subset(np.isin(observations.frame, frames))
     product = _per_frame(seen, seen.log_product)
-    return np.abs(product - _frames_before(product, 1))
+    return np.abs(_since_frame_before(product))
 
 
 def _centring(effects: Sequence[PhotometricEffect]) -> Array:

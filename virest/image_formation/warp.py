@@ -93,16 +93,16 @@ def corner_points(width: int, height: int) -> Array:
     return np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
 
 
-def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_depth: Any = None) -> NDArray[np.float32]:
+def dense_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:
     """Where the rows saw every pixel of the reference time, (height, width, 2), as cv2.remap expects it.
 
     Computed on a grid and interpolated; the map is smooth, so the error is below 0.01 px.
     """
 
     def recorded(points: Array) -> Array:
-        return seen_by_rows(motion, points, motion.reference_s, anchor, inverse_depth, PIXELS_WITHIN_PX)
+        return seen_by_rows(motion, points, motion.reference_s, anchor, within_px=PIXELS_WITHIN_PX)
 
-    return grid_filled(motion, recorded, spacing_px)
+    return grid_filled(motion, recorded)
 
 
 def grid_filled(
