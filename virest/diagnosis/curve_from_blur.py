@@ -41,6 +41,7 @@ from virest.image_formation.warp import moved_between
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.robust import robust_std
+from virest.inference.time_blocks import evenly_chosen
 from virest.motion.trajectory import Trajectory
 
 Gray = NDArray[np.uint8]
@@ -299,7 +300,7 @@ def _compare(
     kernels = [
         [_kernel(path) for path in path_over_exposure(middles, frame, camera)] for frame in (sharp[0], blurred[0])
     ]
-    chosen = _evenly_chosen([k for k, tile in enumerate(tiles) if _is_usable(usable[tile])], MOST_TILES)
+    chosen = evenly_chosen(np.flatnonzero([_is_usable(usable[tile]) for tile in tiles]), MOST_TILES).tolist()
     pixels = [_compared(usable, tiles[k]) for k in chosen]
     if not chosen:
         return []
@@ -335,11 +336,6 @@ def _compare(
     ends = np.cumsum([len(at[0]) for at in pixels])
     parts = [slice(end - len(at[0]), end) for end, at in zip(ends, pixels, strict=True)]
     return [_tile_scores([stack[part] for stack in stacks], tuple(steps.values()), free[part]) for part in parts]
-
-
-def _evenly_chosen(numbers: list[int], count: int) -> list[int]:
-    """At most ``count`` of the numbers, evenly spaced."""
-    return [numbers[k] for k in np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int))]
 
 
 def _is_usable(usable: Mask) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from virest.arrays import Array, Index, Mask, Picture
 from virest.capture.records import Frame
-from virest.inference.edges import parallel_profiles
+from virest.inference.edges import moved_profiles, parallel_profiles
 from virest.inference.unsharp_mask import MIN_STEP_LEVELS, UNCLIPPED_LEVELS
 
 REACH_PX, STEP_PX = 9.0, 0.5
@@ -86,13 +86,4 @@ def _isolated(levels: Array) -> tuple[Array, Index]:
     part, kept = part[flat], kept[flat]
     middle = crossing(part, 0.5, _ALONG_PX)
     centred = np.abs(middle) < MAX_OFF_PX
-    return _moved(part[centred], middle[centred]), kept[centred]
-
-
-def _moved(part: Array, middle: Array) -> Array:
-    """Profiles resampled on GRID_PX with their middles at 0, by linear interpolation."""
-    at = (GRID_PX + middle[:, None] - _ALONG_PX[0]) / STEP_PX
-    index = np.clip(at.astype(np.intp), 0, len(_ALONG_PX) - 2)
-    share = at - index
-    rows = np.arange(len(part))[:, None]
-    return np.asarray(part[rows, index] * (1 - share) + part[rows, index + 1] * share)
+    return moved_profiles(part[centred], middle[centred], _ALONG_PX, GRID_PX), kept[centred]

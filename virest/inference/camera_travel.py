@@ -233,11 +233,6 @@ class VisualInertialAlignment:
         return tuple(window for stretch in self.stretches for window in stretch.windows)
 
     @property
-    def trusted(self) -> bool:
-        """Whether any window's velocity is known in metres."""
-        return any(not window.reason for window in self.windows)
-
-    @property
     def refused(self) -> str:
         """The most frequent reason why windows have no metric velocity; empty if all have one."""
         if self.reason:

@@ -90,3 +90,11 @@ def parallel_profiles(picture: Picture, points: Array, normals: Array, along_px:
         x, y = where[..., 0].astype(np.float32), where[..., 1].astype(np.float32)
         total += cv2.remap(plane, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT)
     return total / len(TANGENT_PX)
+
+
+def moved_profiles(profiles: Array, middle_px: Array, along_px: Array, grid_px: Array) -> Array:
+    """Profiles (n, m) sampled evenly at ``along_px``, with their middles (n,) moved to 0, on a grid; linear between."""
+    at = (grid_px + middle_px[:, None] - along_px[0]) / (along_px[1] - along_px[0])
+    index = np.clip(at.astype(np.intp), 0, len(along_px) - 2)
+    share, rows = at - index, np.arange(len(profiles))[:, None]
+    return np.asarray(profiles[rows, index] * (1 - share) + profiles[rows, index + 1] * share)

@@ -115,7 +115,7 @@ class ObservedTracks:
     def table(self, max_points: int) -> TrackTable:
         """All points in one table, evenly thinned to about max_points."""
         stride = max(-(-self.tracks // max_points), 1)
-        pairs = [_thinned(pair, k % stride, stride) for k, pair in enumerate(self.pairs)]
+        pairs = [_selected(pair, slice(k % stride, None, stride)) for k, pair in enumerate(self.pairs)]
         table = track_table(pairs, self.stamp_s, self.exposure_s, self.noise_px, self._windows())
         return replace(table, bits_per_px=self.bits_per_px)
 
@@ -157,22 +157,8 @@ def guessed_lens(profile: CameraProfile) -> Intrinsics:
     return profile.lens_of(GUESSED_FOCAL * max(profile.width, profile.height))
 
 
-def _selected(pair: TrackPair, use: NDArray[np.bool_]) -> TrackPair:
-    return replace(
-        pair,
-        points_first_px=pair.points_first_px[use],
-        points_second_px=pair.points_second_px[use],
-        forward_backward_px=None,
-    )
-
-
-def _thinned(pair: TrackPair, start: int, stride: int) -> TrackPair:
-    return replace(
-        pair,
-        points_first_px=pair.points_first_px[start::stride],
-        points_second_px=pair.points_second_px[start::stride],
-        forward_backward_px=None,
-    )
+def _selected(pair: TrackPair, rows: NDArray[np.bool_] | slice) -> TrackPair:
+    return replace(pair, points_first_px=pair.points_first_px[rows], points_second_px=pair.points_second_px[rows])
 
 
 def track_table(

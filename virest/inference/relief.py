@@ -21,6 +21,7 @@ from virest.arrays import Array, Index, Mask
 from virest.image_formation.point_model import SMALLEST_DEPTH
 from virest.inference.depth import NEAR_S, OUTSIDE, Sightings
 from virest.inference.robust import CAUCHY
+from virest.inference.time_blocks import evenly_chosen
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief, angles
 
@@ -115,7 +116,7 @@ def measure_roughness(sights: Sightings, grid: Grid) -> Roughness | None:
     precise = variance < MOST_STD_RATIO**2 * np.median(variance)
     edges = grid.extent * np.geomspace(FINEST_LAG, WIDEST_LAG, LAGS)
     total, count = np.zeros((2, LAGS - 1)), np.zeros(LAGS - 1)
-    for pair in _evenly_chosen(np.unique(sights.pair), COMPARED_PAIRS):
+    for pair in evenly_chosen(np.unique(sights.pair), COMPARED_PAIRS):
         mine = np.flatnonzero(precise & (sights.pair == pair))
         first, second = (mine[k] for k in np.triu_indices(len(mine), 1))
         lag = np.searchsorted(edges, np.linalg.norm(place[first] - place[second], axis=-1)) - 1
@@ -389,7 +390,7 @@ def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) ->
     if rough is None or not rough.sill_per_m > 0:
         return None
     priors = [relief_prior(rough, grid, stiffness) for stiffness in STIFFNESSES]
-    chosen = _evenly_chosen(np.unique(sights.pair), JUDGED_INSTANTS)
+    chosen = evenly_chosen(np.unique(sights.pair), JUDGED_INSTANTS)
     instants = [float(np.median(sights.points.time_s[sights.pair == pair])) for pair in chosen]
     frames = [points_in_frame(sights, view(instant), priors[0]) for instant in instants]
     gains = [surface_gain(frames, prior) for prior in priors]
@@ -398,8 +399,3 @@ def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) ->
     text = "relief %s, stiffness %s: held-out residuals %.0f %% smaller, %.1f standard errors"
     log.debug(text, rough, STIFFNESSES[best], 100 * gain, sigma)
     return WindowRelief(sights, priors[best]) if gain > LEAST_GAIN and sigma > LEAST_SIGMA else None
-
-
-def _evenly_chosen(values: Index, count: int) -> Index:
-    """At most ``count`` of the values, spread evenly."""
-    return values[np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).astype(int))]

@@ -30,7 +30,7 @@ from virest.arrays import Array, Picture
 from virest.image_formation.kernels import blur_chords
 from virest.image_formation.row_motion import RowMotion
 from virest.inference.chance import normal_tail
-from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
+from virest.inference.edges import EdgeSettings, find_edges, moved_profiles, parallel_profiles
 from virest.inference.robust import robust_std
 
 RADIUS_PX, RADIUS_SPREAD = 1.2, 0.3
@@ -212,15 +212,7 @@ def _beside_plateau(levels: Array) -> Array:
     before, after = part[rows, last], part[rows, last + 1]
     middle = ALONG_PX[last] + (ALONG_PX[1] - ALONG_PX[0]) * (0.5 - before) / (after - before)
     centred = np.abs(middle) < MAX_OFF_PX
-    return _moved(part[centred], middle[centred])
-
-
-def _moved(part: Array, middle: Array) -> Array:
-    """Profiles with their middles at 0, on GRID_PX, linear between samples."""
-    at = (GRID_PX + middle[:, None] - ALONG_PX[0]) / (ALONG_PX[1] - ALONG_PX[0])
-    index = np.clip(at.astype(np.intp), 0, len(ALONG_PX) - 2)
-    rows = np.arange(len(part))[:, None]
-    return np.asarray(part[rows, index] * (1 - (at - index)) + part[rows, index + 1] * (at - index))
+    return moved_profiles(part[centred], middle[centred], ALONG_PX, GRID_PX)
 
 
 def _inner_width(profiles: Array) -> Array:
