@@ -10,9 +10,8 @@ import numpy as np
 from virest.arrays import Array, Index, Mask, Picture
 from virest.capture.records import Frame
 from virest.inference.edges import moved_profiles, parallel_profiles
-from virest.inference.unsharp_mask import MIN_STEP_LEVELS, UNCLIPPED_LEVELS
+from virest.inference.unsharp_mask import ALONG_PX, MIN_STEP_LEVELS, UNCLIPPED_LEVELS
 
-REACH_PX, STEP_PX = 9.0, 0.5
 PLATEAU_PX = 5.0
 """A profile must be flat beyond this distance, where the effect of a 2 px unsharp mask has faded."""
 MAX_PLATEAU_RMS = 0.04
@@ -20,7 +19,6 @@ MAX_PLATEAU_RMS = 0.04
 MAX_OFF_PX = 1.0
 """Maximum distance between the gradient maximum and the middle of its step."""
 GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)
-_ALONG_PX = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +53,7 @@ def join_steps(parts: Sequence[IsolatedSteps]) -> IsolatedSteps:
 
 def isolated_steps(picture: Picture, frame: Frame, points_px: Array, normals: Array) -> IsolatedSteps:
     """The isolated steps among a frame's edges (n, 2), (n, 2) from `find_edges`; frame: with an exposure."""
-    profile, kept = _isolated(parallel_profiles(picture, points_px, normals, _ALONG_PX))
+    profile, kept = _isolated(parallel_profiles(picture, points_px, normals, ALONG_PX))
     times = ((time_s or 0.0) * np.ones(len(kept)) for time_s in (frame.time_s, frame.exposure_s))
     return IsolatedSteps(profile, points_px[kept], normals[kept], *times)
 
@@ -76,7 +74,7 @@ def _isolated(levels: Array) -> tuple[Array, Index]:
     low, high = UNCLIPPED_LEVELS
     kept = np.flatnonzero((levels.min(axis=1) > low) & (levels.max(axis=1) < high))
     levels = levels[kept]
-    dark, bright = _ALONG_PX <= -PLATEAU_PX, _ALONG_PX >= PLATEAU_PX
+    dark, bright = ALONG_PX <= -PLATEAU_PX, ALONG_PX >= PLATEAU_PX
     ends = [np.median(levels[:, side], axis=1) for side in (dark, bright)]
     step = ends[1] - ends[0]
     part = (levels - ends[0][:, None]) / np.maximum(step, 1e-3)[:, None]
@@ -84,6 +82,6 @@ def _isolated(levels: Array) -> tuple[Array, Index]:
     once = (np.diff((part >= 0.5).astype(np.int8), axis=1) != 0).sum(axis=1) == 1
     flat = (step > MIN_STEP_LEVELS) & (np.maximum(*rms) < MAX_PLATEAU_RMS) & once
     part, kept = part[flat], kept[flat]
-    middle = crossing(part, 0.5, _ALONG_PX)
+    middle = crossing(part, 0.5, ALONG_PX)
     centred = np.abs(middle) < MAX_OFF_PX
-    return moved_profiles(part[centred], middle[centred], _ALONG_PX, GRID_PX), kept[centred]
+    return moved_profiles(part[centred], middle[centred], ALONG_PX, GRID_PX), kept[centred]

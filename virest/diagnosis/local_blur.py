@@ -33,7 +33,6 @@ from virest.diagnosis.local_blur_edges import (
 )
 from virest.diagnosis.local_blur_model import (
     across,
-    covariates,
     fitted_width,
     path_tensors,
     predicted_ratios,
@@ -93,10 +92,8 @@ class BlurObservations:
 
     edges: EdgeWidths
     ratios: SpectrumRatios
-    candidates: int
-    """Number of strong gradients tested as edges, whether or not the image moved across them."""
     isolated: int
-    """Number of these that are isolated steps."""
+    """Number of the edges' candidates that are isolated steps, whether or not the image moved across them."""
     bits_per_px: float = inf
     """Bit rate of the movie."""
     steps: IsolatedSteps | None = None
@@ -134,19 +131,7 @@ class BlurObservations:
     @property
     def edges_determined(self) -> bool:
         """Whether the scene has enough isolated steps to distinguish a defocused image from smooth content."""
-        return len(self.edges) >= MIN_EDGES and self.isolated >= MIN_ACCEPTED * self.candidates
-
-    def covariates(self, profile: CameraProfile, trajectory: Trajectory) -> dict[str, Array]:
-        """Covariates of the residuals, one value per residual."""
-        tile, _ = np.nonzero(self.valid)
-        e, r = self.edges, self.ratios
-        stamps, exposures = (
-            np.concatenate([a, b[tile, 0, 0]]) for a, b in ((e.stamp_s, r.stamp_s), (e.exposure_s, r.exposure_s))
-        )
-        found = covariates(stamps, exposures, np.concatenate([e.points_px, r.points_px[tile, 0]]), profile, trajectory)
-        found["brightness"] = np.concatenate([e.brightness, r.brightness[tile]])
-        found["frame"] = np.concatenate([e.frame, r.frame[tile, 0]]).astype(float)
-        return found
+        return len(self.edges) >= MIN_EDGES and self.isolated >= MIN_ACCEPTED * self.edges.candidates
 
 
 def frames_to_read(capture: Capture, pairs: int = 22) -> list[int]:
@@ -209,7 +194,7 @@ def _measured(
 
     At most PAIR_FRAMES + 1 frames are in memory.
     """
-    settings, only_paired = EdgeSettings(), frozenset(wanted[:lead])
+    only_paired = frozenset(wanted[:lead])
     edges: list[EdgeWidths] = []
     steps: list[IsolatedSteps] = []
     pairs: list[SpectrumRatios] = []
@@ -218,8 +203,8 @@ def _measured(
         if picture is None or not frames[index].exposure_s:
             continue
         if index not in only_paired:
-            found = find_edges(picture, settings)
-            edges.append(observe_picture(picture, frames[index], curve, settings, found))
+            found = find_edges(picture, EdgeSettings())
+            edges.append(observe_picture(picture, frames[index], curve, *found))
             steps.append(isolated_steps(picture, frames[index], *found))
         kept[index] = SeenFrame(picture, _recent(frames, index))
         if index - PAIR_FRAMES in kept and index not in only_paired:
@@ -244,7 +229,7 @@ def _chosen(
     through = transfers(ratios, profile, trajectory)[:, :, 0].min(axis=1)
     ratio = np.where(through > MIN_TRANSFER, ratios.log_ratio, np.nan)
     isolated = len(isolated_edges(edges))
-    return BlurObservations(still, replace(ratios, log_ratio=ratio), edges.candidates, isolated, bits_per_px)
+    return BlurObservations(still, replace(ratios, log_ratio=ratio), isolated, bits_per_px)
 
 
 @dataclass(frozen=True, slots=True)

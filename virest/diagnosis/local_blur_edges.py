@@ -27,7 +27,8 @@ from scipy.special import erf
 from virest.arrays import Array, Index, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
-from virest.inference.edges import TANGENT_PX, EdgeSettings, find_edges, sampled
+from virest.inference.edges import TANGENT_PX, sampled
+from virest.inference.unsharp_mask import MIN_STEP_LEVELS
 
 STEP_PX = 0.5
 """Sample spacing of a profile."""
@@ -40,6 +41,8 @@ WIDTH_MARGIN = 1.2
 Widths in one capture scatter by 4 to 14 % (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
 MAX_SOFTNESS_RATIO = 2.0
 """Other frames of a capture may be up to this many times as soft, so reaches are fitted up to that width."""
+MAX_MISFIT = 0.02
+"""Largest rms of a profile about its fitted step, relative to the step's height."""
 LEAST_WIDTH_PX = 0.05
 _FIT_STEPS, _FURTHER_STEPS = 12, 3
 """Iterations of the fit from a guess, and from the fit of the same step over a shorter reach."""
@@ -94,18 +97,11 @@ def join_edges(parts: Sequence[EdgeWidths]) -> EdgeWidths:
     return EdgeWidths(**rows, candidates=sum(part.candidates for part in parts))
 
 
-def observe_picture(
-    picture: Picture,
-    frame: Frame,
-    curve: ResponseCurve,
-    settings: EdgeSettings,
-    found: tuple[Array, Array] | None = None,
-) -> EdgeWidths:
-    """Widths of the edges in one frame, over every reach; found: the result of :func:`find_edges`, if available."""
-    points, normals = find_edges(picture, settings) if found is None else found
+def observe_picture(picture: Picture, frame: Frame, curve: ResponseCurve, points: Array, normals: Array) -> EdgeWidths:
+    """Widths of the edges in one frame, over every reach; points, normals: of :func:`find_edges`."""
     grey = _profiles(picture.astype(np.float32), points, normals)
     light = _profiles(curve.linear_table()[picture], points, normals)
-    fit = measure_widths(light, settings.max_misfit)
+    fit = measure_widths(light)
     step_levels, brightest, brightness = _levels_of(grey[fit.row], fit.reach_px)
     clipped = brightest > float(np.flatnonzero(~curve.clipped_table(1.5)).max(initial=0))
     full = np.ones(len(fit.row))
@@ -117,7 +113,7 @@ def observe_picture(
         normal=normals[fit.row],
         number=fit.row,
         reach_px=fit.reach_px,
-        width_px=np.where((step_levels > settings.min_step_levels) & ~clipped, fit.width_px, 0.0),
+        width_px=np.where((step_levels > MIN_STEP_LEVELS) & ~clipped, fit.width_px, 0.0),
         step_levels=step_levels,
         brightness=brightness / 255.0,
         candidates=len(points),
@@ -198,7 +194,7 @@ class WidthFit:
     reach_px: Array
 
 
-def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
+def measure_widths(profiles: Array) -> WidthFit:
     """Fit profiles (n, m) of a frame over all reaches that may be shared; keep those that hold ISOLATION widths.
 
     The reaches follow from the profiles alone, not from a predicted blur, so no model chooses its own evidence.
@@ -222,7 +218,7 @@ def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
             & (ISOLATION * width + 1.0 <= reach - np.abs(centre))
             & (np.abs(centre) < 0.5 * reach)
         )
-        good = (misfit < max_misfit) & (width > LEAST_WIDTH_PX)
+        good = (misfit < MAX_MISFIT) & (width > LEAST_WIDTH_PX)
         ended |= ends & good
         parts.append((*np.nonzero(ends), np.where(good, width, 0.0)[ends], centre[ends], np.full(ends.sum(), reach)))
     return WidthFit(*(np.concatenate(column) for column in zip(*parts, strict=True)))

@@ -41,8 +41,6 @@ SIGNAL_TO_FLOOR = 8.0
 class SpectrumRatios:
     """One row per tile seen in two frames; (…, 2) holds the first and the second frame."""
 
-    frame: Index
-    """(n, 2) movie indices."""
     stamp_s: Array
     """(n, 2, MEMORY) camera clock, of the frame itself and of those before it, newest first."""
     exposure_s: Array
@@ -51,11 +49,9 @@ class SpectrumRatios:
     """(n, 2, 2) centre of the tile."""
     log_ratio: Array
     """(n, b) log of first over second power, in each ring and sector of :func:`bins`; NaN where noise dominates."""
-    brightness: Array
-    """(n,) mean grey, 0 to 1."""
 
     def __len__(self) -> int:
-        return len(self.frame)
+        return len(self.points_px)
 
 
 @lru_cache(maxsize=1)
@@ -135,12 +131,10 @@ def observe_pair(first: SeenFrame, second: SeenFrame, curve: ResponseCurve) -> S
     both = np.ones((int(keep.sum()), 1, 1))
     logs = (first.recent, second.recent)
     return SpectrumRatios(
-        frame=np.array([[recent[0].index for recent in logs]], np.intp).repeat(len(both), axis=0),
         stamp_s=both * [[f.time_s for f in recent] for recent in logs],
         exposure_s=both * [[f.exposure_s or 0.0 for f in recent] for recent in logs],
         points_px=np.stack([start, moved], 1)[keep],
         log_ratio=ratio[keep],
-        brightness=grey_1[keep] / 255.0,
     )
 
 
@@ -148,9 +142,8 @@ def join_ratios(parts: Iterable[SpectrumRatios]) -> SpectrumRatios:
     """Concatenate the rows of several pairs."""
     parts = list(parts)
     if not parts:
-        none = np.zeros((0, 2), np.intp)
         logs = np.zeros((0, 2, MEMORY))
-        return SpectrumRatios(none, logs, logs, np.zeros((0, 2, 2)), np.zeros((0, bin_count())), np.zeros(0))
+        return SpectrumRatios(logs, logs, np.zeros((0, 2, 2)), np.zeros((0, bin_count())))
     return SpectrumRatios(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SpectrumRatios)))
 
 

@@ -95,16 +95,6 @@ class PhotometricObservations:
         """The same with another encoder memory."""
         return replace(self, memory=memory)
 
-    def covariates(self, profile: CameraProfile) -> dict[str, Array]:
-        """Covariates of the residuals."""
-        return {
-            "row": self.row_fraction,
-            "time": self.row_time_s(profile),
-            "radius": self.radius,
-            "brightness": self.grey,
-            "exposure": self.exposure_s,
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class Prediction:

@@ -124,10 +124,8 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
     assert observations is not None
     left = photometry.residuals(observations, photometric.profile)
     covariates = {
-        name: values
-        for name, values in observations.covariates(photometric.profile).items()
-        if name in ("row", "radius", "brightness")
-    }
+        "row": observations.row_fraction, "radius": observations.radius, "brightness": observations.grey,
+    }  # fmt: skip
     weight = cauchy_weight(left**2, HALF_WEIGHT_SIGMA * max(robust_std(left), 1.0))
     found = structures(left[:, None], weight, covariates, observations.frame.astype(np.intp), 0.5)
     strongest = max(found, key=lambda s: s.size)

@@ -26,10 +26,6 @@ class EdgeSettings:
     """Side of the squares; each gives one edge for each of four directions."""
     min_slope_levels: float = 2.0
     """Smallest slope of a candidate, grey levels per pixel after smoothing by 1 px."""
-    min_step_levels: float = 30.0
-    """Smallest height of a step, grey levels."""
-    max_misfit: float = 0.02
-    """Largest rms of a profile about its fitted step, relative to the step's height."""
 
 
 def find_edges(picture: Picture, settings: EdgeSettings) -> tuple[Array, Array]:
