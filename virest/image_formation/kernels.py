@@ -81,12 +81,9 @@ class KernelField:
         return replace(self, paths_px=self.paths_px * scale, defocus_sigma_px=self.defocus_sigma_px * scale)
 
 
-def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inverse_depth: Any = None) -> KernelField:
-    """Blur paths of tiles centred at pixels (n, 2), with the rows' own times in both pictures.
-
-    inverse_depth: (n,) of each tile, 1/m; None: that of the frame's plane.  Flicker and defocus are the profile's.
-    """
-    return field_along(motion, centres_px, _path_nodes(motion, centres_px, anchor, inverse_depth), anchor)
+def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5) -> KernelField:
+    """Blur paths of tiles centred at pixels (n, 2), with the rows' own times in both pictures."""
+    return field_along(motion, centres_px, _path_nodes(motion, centres_px, anchor), anchor)
 
 
 def smooth_field(motion: RowMotion, anchor: float = 0.5) -> Callable[[Array], KernelField]:
@@ -127,14 +124,11 @@ def instants(motion: RowMotion, points_px: Array) -> Array:
     return motion.row_time_s(points_px[:, None], np.linspace(0.0, 1.0, count))
 
 
-def _path_nodes(motion: RowMotion, centres_px: Array, anchor: float, inverse_depth: Any = None) -> Array:
+def _path_nodes(motion: RowMotion, centres_px: Array, anchor: float) -> Array:
     """Displacements (n, k, 2) at evenly spaced instants of the exposure, ends included: a spline's nodes."""
     gathered_s = instants(motion, centres_px)
-    count = gathered_s.shape[1]
-    points = np.broadcast_to(centres_px[:, None], (len(centres_px), count, 2))
-    if inverse_depth is not None:
-        inverse_depth = np.broadcast_to(np.asarray(inverse_depth, float)[..., None], gathered_s.shape)
-    return seen_by_rows(motion, points, gathered_s, anchor, inverse_depth, PIXELS_WITHIN_PX) - points
+    points = np.broadcast_to(centres_px[:, None], (*gathered_s.shape, 2))
+    return seen_by_rows(motion, points, gathered_s, anchor, PIXELS_WITHIN_PX) - points
 
 
 def field_along(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: float) -> KernelField:
@@ -167,13 +161,13 @@ def _between(count: int, samples: int) -> Array:
     return np.asarray(CubicSpline(np.linspace(0.0, 1.0, count), np.eye(count))(middles))
 
 
-def blur_chords(motion: RowMotion, points_px: Array, inverse_depth: Any = None) -> Array:
+def blur_chords(motion: RowMotion, points_px: Array) -> Array:
     """Motion (n, 2) in pixels of image points over the exposure of their own rows, start to end (eqs 12-14).
 
     Its angle and length are the paper's degradation parameters (eqs 15, 16); see :func:`angle_and_length`.
     """
     start_s, end_s = (motion.row_time_s(points_px, share) for share in (ROW_START, ROW_END))
-    return moved_between(motion, points_px, start_s, end_s, inverse_depth) - points_px
+    return moved_between(motion, points_px, start_s, end_s) - points_px
 
 
 def angle_and_length(chords_px: Array) -> tuple[Array, Array]:

@@ -39,7 +39,7 @@ class NeighbourView:
     def places_px(self, points_px: Array) -> Array:
         """Pixels at which the neighbour recorded what the frame's anchored picture shows at pixels (..., 2)."""
         seen_s = self.frame.row_time_s(points_px, self.anchor)
-        return seen_by_rows(self.neighbour, points_px, seen_s, self.anchor, None, PIXELS_WITHIN_PX)
+        return seen_by_rows(self.neighbour, points_px, seen_s, self.anchor, PIXELS_WITHIN_PX)
 
     def apart_s(self, points_px: Array) -> Array:
         """(n,) time from the frame's to the neighbour's observation of what the frame shows at pixels (n, 2)."""
@@ -67,7 +67,7 @@ class NeighbourView:
             places = self.places_px(centres_px)
             gathered_s = instants(self.neighbour, places)
             points = np.broadcast_to(places[:, None], (*gathered_s.shape, 2))
-            seen = seen_by_rows(self.frame, points, gathered_s, self.anchor, None, PIXELS_WITHIN_PX)
+            seen = seen_by_rows(self.frame, points, gathered_s, self.anchor, PIXELS_WITHIN_PX)
             return seen - centres_px[:, None]
 
         at = splined_nodes(self.frame, nodes)
