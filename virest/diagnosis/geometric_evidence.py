@@ -23,20 +23,6 @@ from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directio
 from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import InertialMotion, Motion
 
-__all__ = [
-    "Evidence",
-    "Model",
-    "base_scene",
-    "capped_rms",
-    "depth_of",
-    "distances",
-    "fit_model",
-    "free_scene",
-    "loss",
-    "make_evidence",
-    "relief_loss",
-]
-
 CAP = 4.0
 """Residual cap, in median scales, so that single lost tracks do not dominate."""
 BLOCK_LENGTHS = (7, 11, 8, 13, 9)
