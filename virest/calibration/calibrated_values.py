@@ -146,13 +146,6 @@ def value_of(
     return CalibratedValue(shown.name, before, after, stds if len(stds) > 1 else stds[0], determined)
 
 
-def direction_value(given: CameraProfile, profile: CameraProfile, known: bool) -> CalibratedValue:
-    """The readout direction, as a word."""
-    return CalibratedValue(
-        "readout_direction", given.shutter.readout_direction, profile.shutter.readout_direction, None, known
-    )
-
-
 def with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) -> CameraProfile:
     """Add the estimates of determined and rough values to the profile."""
     source = "tracked points against the inertial data"

@@ -20,7 +20,6 @@ from virest.calibration.calibrated_values import (
     beyond_limits,
     calibrated,
     correlations_of,
-    direction_value,
     global_shutter,
     is_determined,
     reset_undetermined,
@@ -455,7 +454,8 @@ def _conclude(
         values = tuple(replace(v, note=GLOBAL_SHUTTER) if v.name == "readout_time_s" else v for v in values)
     else:
         direction_known = rough.direction_known and determined["readout_time"]
-        values = (*values[:2], direction_value(given, profile, direction_known), *values[2:])
+        words = given.shutter.readout_direction, profile.shutter.readout_direction
+        values = (*values[:2], CalibratedValue("readout_direction", *words, None, direction_known), *values[2:])
     profile = with_estimates(profile, values)
     moving = float(np.mean(fit.weight < OUTLIER_WEIGHT))
     notes = _notes(coarse, fit, moving, joint.excluded, observed, determined)

@@ -102,7 +102,9 @@ def candidates_of(
     in_terms = {term.name for term in model.terms}
     found: list[Candidate] = []
     for effect in GEOMETRIC_EFFECTS:
-        if effect.name in tried or effect.name in in_terms or not _is_identifiable(evidence, effect):
+        # a constant exposure is indistinguishable from an offset
+        unknowable = effect.name == "exposure_time" and not varies(evidence.observed.exposure_s)
+        if effect.name in tried or effect.name in in_terms or unknowable:
             continue
         if effect.term is None:
             found += _word_candidates(effect, model)
@@ -117,11 +119,6 @@ def candidates_of(
     if "frame_lag" not in tried:
         found += [_lag_candidate(model, *lag) for lag in lags]
     return found
-
-
-def _is_identifiable(evidence: Evidence, effect: GeometricEffect) -> bool:
-    """Whether points can identify this cause: a constant exposure time is indistinguishable from an offset."""
-    return effect.name != "exposure_time" or varies(evidence.observed.exposure_s)
 
 
 def varies(exposure_s: Array) -> bool:

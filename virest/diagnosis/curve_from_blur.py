@@ -104,16 +104,11 @@ class MixingEvidence:
 
     def subset(self, use: Mask) -> MixingEvidence:
         """Only the chosen tiles."""
-        return MixingEvidence(
-            self.pair[use],
-            self.pixels[use],
-            self.noise[use],
-            self.darkest,
-            self.steps,
-            {name: v[use] for name, v in self.stiffness.items()},
-            {name: v[use] for name, v in self.score.items()},
-            {name: v[use] for name, v in self.rest.items()},
+        stiffness, score, rest = (
+            {name: v[use] for name, v in kind.items()} for kind in (self.stiffness, self.score, self.rest)
         )
+        pair, pixels, noise = self.pair[use], self.pixels[use], self.noise[use]
+        return MixingEvidence(pair, pixels, noise, self.darkest, self.steps, stiffness, score, rest)
 
     @property
     def largest_black(self) -> float:
@@ -231,8 +226,7 @@ def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOutGain | No
         change = _root(evidence.subset(np.isin(evidence.pair, pairs[odd::2])), effect_name)
         held = evidence.subset(np.isin(evidence.pair, pairs[1 - odd :: 2]))
         squares = (held.mean_square(effect_name, 0.0)[0], *held.mean_square(effect_name, change))
-        before, after, noise = np.sqrt(squares).tolist()
-        folds.append((before, after, noise))
+        folds.append(tuple(np.sqrt(squares).tolist()))
     return HeldOutGain.of_folds(PHOTOMETRY, folds)
 
 

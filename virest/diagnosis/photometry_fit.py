@@ -85,11 +85,6 @@ class PhotometricFit:
         """(k,) standard deviations."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """``effect.parameter`` of each value."""
-        return tuple(f"{effect.name}.{name}" for effect in self.effects for name in effect.parameters)
-
     def of(self, effect_name: str) -> tuple[Array, Array]:
         """(values, covariance) of one effect."""
         for effect, own in _parts(self.effects):
@@ -167,7 +162,8 @@ def judge(
     fits = each(fit_photometry, calls)
     judged = []
     for fitted, fit, without in zip(folds, fits[::2], fits[1::2], strict=True):
-        held = _seen_twice(observations.subset(~fitted))
+        held = observations.subset(~fitted)
+        held = held.subset(np.bincount(held.patch)[held.patch] >= 2)  # a single observation has no residual
         before, noise = normalised_rms(held.with_memory(without.memory), without.profile)
         judged.append((before, normalised_rms(held.with_memory(fit.memory), fit.profile)[0], noise))
     return HeldOutGain.of_folds(PHOTOMETRY, judged)
@@ -251,11 +247,6 @@ def _since_frame_before(values: Array) -> Array:
 
 def _per_frame(observations: PhotometricObservations, values: Array) -> Array:
     return np.array([values[np.argmax(observations.frame == k)] for k in observations.frames])
-
-
-def _seen_twice(held: PhotometricObservations) -> PhotometricObservations:
-    """The observations without patches that are held out only once: a single observation has no residual."""
-    return held.subset(np.bincount(held.patch)[held.patch] >= 2)
 
 
 def _fitted_part(

@@ -322,11 +322,8 @@ def changes_of(
 
 def sentence_of(name: str, changes: dict[str, ParameterChange]) -> str:
     """What a cause means, for readers."""
-    return SENTENCES[name].format(**{key: _shown(change.estimate) for key, change in changes.items()})
-
-
-def _shown(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    values = {key: change.estimate for key, change in changes.items()}
+    return SENTENCES[name].format(**{k: f"{v:.3g}" if isinstance(v, float) else str(v) for k, v in values.items()})
 
 
 def judge_curve(

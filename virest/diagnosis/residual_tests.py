@@ -12,9 +12,10 @@ from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.structure import Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
-from virest.image_formation.point_model import seen_s
+from virest.image_formation.point_model import TrackTable, seen_s
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.robust import cauchy_weight, robust_std
+from virest.inference.track_fit import TrackFit
 
 log = logging.getLogger(__name__)
 
@@ -49,23 +50,12 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     explains this, it belongs to the scene and is not an error of the model.
     """
     fitted, table = geometric.fit, geometric.table
-    profile, lens = fitted.profile, fitted.profile.intrinsics
-    assert lens is not None
-    noise = geometric.noise_px
-    from_centre = table.second_px - np.array([lens.cx_px, lens.cy_px])
-    radius = np.linalg.norm(from_centre, axis=-1)
-    outwards = from_centre / np.maximum(radius, 1.0)[:, None]
+    noise, covariates = geometric.noise_px, _covariates(fitted, table)
+    outwards = _from_centre_px(fitted, table) / np.maximum(covariates["radius"], 1.0)[:, None]
     left_px = fitted.across_relief_px()
     radial = (left_px * outwards).sum(axis=-1)
     difference = np.concatenate([left_px, radial[:, None]], axis=-1)
-    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
-    covariates = {
-        "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
-        "radius": radius,
-        "x": table.second_px[:, 0],
-        "y": table.second_px[:, 1],
-        "rate": np.linalg.norm(fitted.integrated.trajectory.rate_rad_s(second_s), axis=-1),
-    }
+    del covariates["time"]
     found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
     found.append(_along_time(left_px, fitted.weight, table.pair))
     strongest = max(found, key=lambda s: s.size)
@@ -87,6 +77,27 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
         p_value = None if geometric.independent_share > STRAY_PART else p_stray
         return Remaining(p_value, "place", strongest.size, GEOMETRY, True, sentence)
     return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, False)
+
+
+def _from_centre_px(fitted: TrackFit, table: TrackTable) -> Array:
+    """(n, 2) from the principal point to the second points."""
+    lens = fitted.profile.intrinsics
+    assert lens is not None
+    return table.second_px - np.array([lens.cx_px, lens.cy_px])
+
+
+def _covariates(fitted: TrackFit, table: TrackTable) -> dict[str, Array]:
+    """What residuals of the second points may depend on."""
+    profile, second_px = fitted.profile, table.second_px
+    second_s = seen_s(profile, second_px, table.second_stamp_s, table.second_exposure_s)
+    return {
+        "row": profile.shutter.readout_fraction(second_px, profile.width, profile.height),
+        "time": second_s,
+        "radius": np.linalg.norm(_from_centre_px(fitted, table), axis=-1),
+        "x": second_px[:, 0],
+        "y": second_px[:, 1],
+        "rate": np.linalg.norm(fitted.integrated.trajectory.rate_rad_s(second_s), axis=-1),
+    }
 
 
 def _more_than_noise(distance: Array, pair: Index, noise: float) -> tuple[float, float]:
@@ -139,20 +150,13 @@ def residuals(geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:
     """Point residuals (px) with their covariates, before or after the causes, for figures."""
     fitted = geometric.nominal_fit if nominal else geometric.fit
     table = geometric.nominal_table if nominal else geometric.table
-    profile, lens = fitted.profile, fitted.profile.intrinsics
-    assert lens is not None
-    centre = np.array([lens.cx_px, lens.cy_px])
-    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
-    rate = np.linalg.norm(fitted.integrated.trajectory.rate_rad_s(second_s), axis=-1)
+    covariates = _covariates(fitted, table)
     return {
         "x_px": fitted.difference_px[:, 0],
         "y_px": fitted.difference_px[:, 1],
-        "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
-        "time": second_s,
-        "radius": np.linalg.norm(table.second_px - centre, axis=-1),
-        "rate": rate,
-        "column": table.second_px[:, 0],
-        "line": table.second_px[:, 1],
+        **{name: covariates[name] for name in ("row", "time", "radius", "rate")},
+        "column": covariates["x"],
+        "line": covariates["y"],
         "pair": table.pair.astype(float),
         "weight": fitted.weight,
         "distance": fitted.distance,

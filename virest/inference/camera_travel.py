@@ -245,7 +245,11 @@ class VisualInertialAlignment:
 
         over_depth: accept windows with velocity over depth only.
         """
-        at = [(s, k, _distance(w, camera_time_s), w) for s in self.stretches for k, w in enumerate(s.windows)]
+        at = [
+            (s, k, max(w.start_s - camera_time_s, camera_time_s - w.end_s, 0.0), w)
+            for s in self.stretches
+            for k, w in enumerate(s.windows)
+        ]
         near = [entry for entry in at if entry[2] <= NEAR_WINDOW_S]
         if not near:
             return self.reason or "no tracked points near this frame"
@@ -312,10 +316,6 @@ class VisualInertialAlignment:
 def _std_with_relief(fit: TrackFit, name: str) -> Array:
     """Standard deviations (k,) of a term's values, with the errors from fixed relief."""
     return np.hypot(fit.std(name), SHARED_RELIEF * fit.by_relief[fit.slices[name]])
-
-
-def _distance(window: Window, time_s: float) -> float:
-    return max(window.start_s - time_s, time_s - window.end_s, 0.0)
 
 
 def _mean(value: Array, std: Array) -> tuple[float, float]:

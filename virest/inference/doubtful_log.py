@@ -77,16 +77,8 @@ def _clipped(imu: ImuSamples, axis: int) -> list[Stretch]:
     longest = max((last - first + 1 for first, last in runs), default=0)
     if at_limit.sum() < max(LEAST_PILED, PILE_RATIO * (below + 1)) or longest < PILED_RUN:
         return []
-    return [
-        Stretch(
-            CLIPPED,
-            float(imu.time_s[max(first - 1, 0)]),
-            float(imu.time_s[min(last + 1, len(size) - 1)]),
-            (axis,),
-            limit,
-        )
-        for first, last in runs
-    ]
+    time_s, end = imu.time_s.tolist(), len(size) - 1
+    return [Stretch(CLIPPED, time_s[max(a - 1, 0)], time_s[min(b + 1, end)], (axis,), limit) for a, b in runs]
 
 
 def _runs(mask: Mask) -> list[tuple[int, int]]:

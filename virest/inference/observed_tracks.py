@@ -15,7 +15,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import RowClock
-from virest.inference.frame_rotations import FrameRotations, picture_turns
+from virest.inference.frame_rotations import FrameRotations, picture_rotation
 from virest.inference.track_noise import step_noise_px
 from virest.inference.tracking import TrackPair
 
@@ -56,7 +56,8 @@ class ObservedTracks:
         clock = RowClock(profile)
         middle = clock.camera_time_s(clock.middle_s(self.stamp_s, self.exposure_s))
         first, second = ([getattr(pair, name) for pair in self.pairs] for name in ("first", "second"))
-        return picture_turns(self.lens, self.pairs, middle[first], middle[second])
+        vectors = np.array([picture_rotation(self.lens, pair) for pair in self.pairs]).reshape(-1, 3)
+        return FrameRotations(middle[first], middle[second], vectors)
 
     def chosen(self, use: NDArray[np.bool_]) -> ObservedTracks:
         """Some of the pairs."""

@@ -225,16 +225,11 @@ def _inner_width(profiles: Array) -> Array:
     return np.where(after > 0, width, np.inf)
 
 
-def _crest(profiles: Array) -> tuple[int, float]:
-    """Index on GRID_PX of the highest median beyond the edge, and its height."""
-    median = np.median(profiles, axis=0)
-    at = int(np.argmax(np.where(GRID_PX > 0, median, 0.0)))
-    return at, float(median[at])
-
-
 def _overshoot(profiles: Array, bare_std: float) -> tuple[float, float]:
     """Overshoot of profiles and its standard deviation; bare_std: that of unsharpened movies alone."""
-    at, crest = _crest(profiles)
+    median = np.median(profiles, axis=0)
+    at = int(np.argmax(np.where(GRID_PX > 0, median, 0.0)))
+    crest = float(median[at])
     typical = robust_std(profiles[:, at] - crest)
     noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / EDGES_PER_SAMPLE)
     return crest - 1, float(np.hypot(noise, bare_std))

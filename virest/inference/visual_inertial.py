@@ -238,16 +238,9 @@ def _judged(stretch: Stretch, rotating: TrackFit, window: int, depth_m: float | 
     flow_std = np.sqrt(np.trace(flow_covariance, axis1=-2, axis2=-1).mean() / max((flow**2).sum(axis=-1).mean(), 1e-12))
     left, before = _left(fit, mine), _left(rotating, mine)
     found = Window(
-        start_s,
-        end_s,
-        scale_std,
-        float(spread) / speed,
-        before / max(left, 1e-6),
-        left,
-        "",
-        fit.depth_spread_per_m / inverse,
-        float(flow_std),
-    )
+        start_s, end_s, scale_std, float(spread) / speed, before / max(left, 1e-6), left, "",
+        fit.depth_spread_per_m / inverse, float(flow_std),
+    )  # fmt: skip
     gravity = float(np.linalg.norm(stretch.scene.gravity_m_s2))
     reason = _no_parallax(found) or _no_fit(found, gravity, before) or _far_from_profile(fit)
     if reason:
