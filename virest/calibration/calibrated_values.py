@@ -21,6 +21,7 @@ from virest.inference.track_fit import TrackFit
 MIN_STRETCHES = 2.5
 """A value must be supported by this effective number of time blocks; with fewer, nothing confirms it."""
 LARGE_CORRELATION = 0.9
+"""Correlation of two errors that is reported: either value is then known 2.3 times better if the other is given."""
 NO_FINDING = "no camera has it"
 GLOBAL_SHUTTER = "global shutter: no readout direction"
 ROUGH_OFFSET_S = 0.01

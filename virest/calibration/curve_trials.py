@@ -29,7 +29,8 @@ SMOOTH_WEIGHT = 5.0
 """Weight of a table's roughness in the fit, which treats sample errors as independent."""
 SCORE_CAP = 16.0
 """Maximum squared normalised residual of one grey in a score."""
-Z_REJECTED = 3.0
+SIGNIFICANT_Z = 3.0
+"""Standard deviations above which a difference is none by chance (1 in 370)."""
 DISTINCT_LEVELS = 0.25
 """Systematic differences between two kinds below this are attributed to rounding and compression."""
 STRUCTURE_LEVELS = 0.3
@@ -118,7 +119,7 @@ class Trial:
         trusted = self.correction_ev[~self.suspect]
         trend = float(self.trend_row[~self.suspect] @ trusted) ** 2
         scatter = max(float(trusted @ trusted) - trend, 0.0) / max(len(trusted) - 2, 1)
-        return trend > Z_REJECTED**2 * max(scatter, TRUSTED_EV**2)
+        return trend > SIGNIFICANT_Z**2 * max(scatter, TRUSTED_EV**2)
 
 
 def require_possible(first: FirstCurve, samples: BracketSamples) -> None:
@@ -245,7 +246,7 @@ def significantly_worse(one: Trial, other: Trial) -> bool:
     gain = np.bincount(index, one.score - other.score)
     if one.held_out_rms**2 - other.held_out_rms**2 < DISTINCT_LEVELS**2:
         return False
-    return bool(gain.mean() > Z_REJECTED * gain.std() / np.sqrt(len(gain)))
+    return bool(gain.mean() > SIGNIFICANT_Z * gain.std() / np.sqrt(len(gain)))
 
 
 def refit(trial: Trial, samples: BracketSamples, may_be_wrong: Mask) -> Trial:

@@ -31,6 +31,7 @@ weight is proportional to it.  For closely spaced exposures the data outweigh it
 """
 PASSES = 4
 CONTRADICTS_EV = 0.1
+"""Smallest error of a listed exposure that is named: five times the standard deviation to which a list is trusted."""
 MIN_PICTURES = 4
 """With fewer pictures, any exposures are consistent with some curve."""
 ROBUST_Z = 4.0

@@ -55,15 +55,17 @@ from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 log = logging.getLogger(__name__)
 
 FEW_POINTS, MANY_POINTS = 2000, 7000
+"""Points of the fits for the readout's axis, and of the joint fit."""
 EXPLAINED_SCALE = 1.15
 """Whitened residuals with a scale below this need no translation."""
 TRANSLATION_GAIN = 0.97
 """A translation is kept if it reduces the residual scale below this fraction."""
 DIRECTION_COST = 12.0
 """Minimum cost difference, in squared residual scales, between readouts along rows and along columns."""
-OUTLIER_WEIGHT = 0.1
+OUTLIER_WEIGHT, MANY_OUTLIERS = 0.1, 0.1
+"""Tracks below this Cauchy weight (7.2 σ) do not follow the camera; a larger part of them is noted."""
 EXCLUSION_PASSES = 3
-MANY_OUTLIERS = 0.1
+"""Most fits after each of which image regions that move independently are excluded."""
 SMALL_PART = 0.01
 """Smallest fraction of points that a note states as a number."""
 CONSTANT_EXPOSURE_S = 1e-4

@@ -32,14 +32,17 @@ FLAT_SHARE = 0.1
 ROUNDING_LEVELS = 0.15
 """Lower limit on the standard deviation of a square's mean, since neighbouring pixels share rounding errors."""
 SMALLEST_VARIANCE, LARGEST_VARIANCE = 0.05, 400.0
+"""Of a pixel, levels²: rounding alone has 1 / 12, and an encoder may leave less."""
 MORE_LIGHT = 2**0.4
 """Minimum exposure ratio of two pictures to test whether a grey follows the light."""
 SAME_LEVELS = 0.75
+"""Greys that differ by less are the same."""
 PILE = 0.02
 """Minimum fraction of a channel's samples that must rest at a grey for it to be an end."""
 DIFFER_LEVELS = 1.5
 """A conversion from YCbCr rounds the three channels to ends that differ by up to this."""
 CUT_SIGMA = 3.0
+"""Greys this many standard deviations of noise from 0 or 255 are clipped in 1 of 740 pixels at most."""
 RELIABLE_SIGMA = 2.0
 """About 2.5 % of the reliable greys are moved beyond the limit by their noise."""
 WINDOW_SITES = 31

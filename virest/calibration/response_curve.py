@@ -25,6 +25,7 @@ from virest.calibration.bracket_samples import MIN_SHARED, BracketPicture, Brack
 from virest.calibration.curve_certainty import CurvePosterior
 from virest.calibration.curve_families import LogLookup, log_lookup
 from virest.calibration.curve_trials import (
+    SIGNIFICANT_Z,
     STRUCTURE_LEVELS,
     Trial,
     choose_kind,
@@ -42,13 +43,12 @@ from virest.calibration.grey_levels import reliably_inside, scatter_by_grey
 from virest.camera.response import KINDS, ResponseCurve
 from virest.errors import CalibrationError, SettingsError
 
-MIN_RATIO = 2**0.25
-FEW_RATIO = 2**1.5
-MOVED_LEVELS = 8.0
-MAX_MOVED = 0.2
+MIN_RATIO, FEW_RATIO = 2**0.25, 2**1.5
+"""Ratios of the largest to the smallest exposure: below 0.25 EV a bracket is refused, below 1.5 EV called weak."""
+MOVED_LEVELS, MAX_MOVED = 8.0, 0.2
+"""A sample that deviates by more, rms over the exposures, has moved; a scene in which a larger part has is not still."""
 WORST_OF_MEDIAN = 3.0
 """A sample is excluded if its largest residual exceeds this multiple of the median over samples."""
-ESTABLISHED_Z = 3.0
 SCATTER_EV = 0.06
 """Scatter of the listed exposures that is reported: three times their prior standard deviation."""
 OPEN_LEVELS = 2.0
@@ -179,7 +179,7 @@ class _Verdict:
     @property
     def established(self) -> Mask:
         """(pictures,): whether an exposure error is significant given the posterior uncertainty of the table."""
-        return np.abs(self.final.correction_ev) > ESTABLISHED_Z * self.posterior.exposure_std_ev
+        return np.abs(self.final.correction_ev) > SIGNIFICANT_Z * self.posterior.exposure_std_ev
 
 
 def _choose_curve(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wrong: Mask) -> _Verdict:

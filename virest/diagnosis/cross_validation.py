@@ -25,6 +25,7 @@ from virest.inference.time_blocks import halves
 from virest.inference.track_fit import Term
 
 JUDGE_POINTS = 3500
+"""Points used to judge a cause; half of them fit it."""
 LAGGING_BLOCK = 2
 """Pairs per block among those that a start-up lag moves: only neighbouring pairs share a frame and its errors."""
 

@@ -43,6 +43,7 @@ from virest.inference.unsharp_mask import SHARPEST
 from virest.motion.trajectory import Trajectory, turned
 
 MIN_USED = 60
+"""Fewest of the sharpest edges from which a mask is fitted."""
 LOCATION_PX, LOCATION_GROUPS = 20.0, 16
 """Cell size of a scene location: edges whose world directions share a cell, at the lens's focal length, show the same
 location; and the number of location groups of the jackknife."""
@@ -64,6 +65,7 @@ SIZE_ERROR = 0.2
 SAME_SIGMA = 3.0
 """A mask that differs from the recorded one by fewer deviations is the same."""
 BOUNDS = ([0.2, 0.0, np.log(0.4)], [3.0, 6.0, np.log(4.0)])
+"""Of the edge width (px), the amount, and the logarithm of the radius, which lie 2.4 and 2.7 σ from its prior."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ MAX_DEPTH_PULL, HELD_DEPTH_STD = 4.0, 1e-3
 HELD_DEPTH_STD), so that this depth is judged."""
 ITERATIONS = 10
 MIN_SWAY_DEPTH_PER_M = 1e-4
+"""Smallest inverse depth: that of the farthest scene (physical_limits.DEPTH_M)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from virest.inference.track_fit import TrackFit
 from virest.inference.tracking_bias import bias_std
 
 STABILISER_CUTOFF_HZ = (0.03, 15.0)
+"""Range of an estimated cutoff; beyond it the fit has run to an end of its own range (changes.CUTOFFS_HZ)."""
 
 
 def refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, TrackFit]:

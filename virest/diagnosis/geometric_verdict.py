@@ -13,6 +13,7 @@ from virest.image_formation.point_model import TrackTable
 from virest.inference.track_fit import TrackFit
 
 FINAL_POINTS = 7000
+"""Points of the last fit, which reports the values: as many as `calibrate` uses."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ MAX_PLATEAU_RMS = 0.04
 MAX_OFF_PX = 1.0
 """Maximum distance between the gradient maximum and the middle of its step."""
 GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)
+"""Distances from the middle of a step at which profiles are compared: PLATEAU_PX, and MAX_OFF_PX of freedom."""
 
 
 @dataclass(frozen=True, slots=True)

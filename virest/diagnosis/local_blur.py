@@ -77,9 +77,11 @@ PARTS = 4
 PAIR_FRAMES = 4
 """Frames from the first to the second of a pair: the camera has rotated, but the patch is still in view."""
 MIN_EDGES = 40
+"""Fewest isolated edges from which a defocus is estimated."""
 MIN_ACCEPTED = 0.004
 """Minimum fraction of the strong gradients that are isolated steps; a smooth scene has almost none."""
 MIN_RATIOS = 400
+"""Fewest measured bins from which an exposure is estimated."""
 MIN_CONTRAST = 0.06
 """Minimum rms of the predicted log ratios: frames with equal motion do not determine the exposure."""
 BLOCKS = 8

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from virest.arrays import Array, Mask
+from virest.calibration.physical_limits import SCALE_OF_EXPOSURE
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import BLUR, HeldOutGain
 from virest.diagnosis.local_blur import (
@@ -29,7 +30,6 @@ from virest.inference.robust import robust_std
 from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
 
-_EXPOSURE_SCALES = (0.05, 20.0)
 SHIFT_STD_S = 0.004
 """Standard deviation of the row times after the geometric fit; their shift is a nuisance parameter of every fit."""
 PATH_STD = 0.03
@@ -44,10 +44,13 @@ _NUISANCE = np.array([LENS_SIGMA_PX, 0.0])
 _NUISANCE_STD = np.array([LENS_STD_PX, SHIFT_STD_S])
 _NUISANCE_LOW = np.array([0.35, -0.03])
 _NUISANCE_HIGH = np.array([0.95, 0.03])
+"""Width of a sharp edge (px) and shift of the rows' times (s): mean, standard deviation, and bounds of the fit."""
 _LOW, _HIGH, _STEP = 0.02, 50.0, 0.02
 """Bounds of every effect's value, and its finite-difference step."""
-_NUISANCE_STEP = np.array([0.02, 5e-4])
-_DAMPING_STEP, _LEAST_STD_PX = 0.02, 1e-3
+_NUISANCE_STEP, _DAMPING_STEP = np.array([0.02, 5e-4]), 0.02
+"""Finite-difference steps of the nuisances and of the damping."""
+_LEAST_STD_PX = 1e-3
+"""Keeps the scale of residuals without noise above 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +66,7 @@ class ExposureTime:
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set shutter.exposure_scale."""
-        return profile.with_shutter(exposure_scale=float(np.clip(values[0], *_EXPOSURE_SCALES)))
+        return profile.with_shutter(exposure_scale=float(np.clip(values[0], *SCALE_OF_EXPOSURE)))
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
         """Whether there are enough tiles in frames with unequal motion."""
@@ -75,7 +78,7 @@ class ExposureTime:
 
     def possible(self, values: Array) -> bool:
         """Whether the scale is within its bounds; at a bound, something else is wrong."""
-        low, high = _EXPOSURE_SCALES
+        low, high = SCALE_OF_EXPOSURE
         return low < float(values[0]) < high
 
     def shows_in(self, observations: BlurObservations) -> Mask:

@@ -21,9 +21,11 @@ from virest.image_formation.warp import seen_by_rows
 from virest.motion.trajectory import Trajectory
 
 _NODES = 4
+"""Nodes along each side for the six terms of a quadratic in position."""
 _INSTANTS = 5
 """Gauss-Legendre nodes of an exposure: exact for paths that are fourth-order polynomials in time."""
 _RATIOS = np.linspace(0.0, 6.0, 25)
+"""Widths of a path over that of the Gaussian at which the ratio is tabulated."""
 LEAST_ANGLE = 1e-3
 """Below it sin q / q is 1 to single precision."""
 

@@ -21,12 +21,15 @@ from virest.capture.records import Frame
 from virest.restoration.statistics.tile_power import white_noise
 
 SIDE_PX = 64
+"""Side of a tile: 64 px resolve the lowest ring, 0.055 cycles per pixel, by 3.5 frequencies."""
 MEMORY = 3
 """Number of frames whose blur a decoded frame may show: its own and, through H.264's prediction, those before it."""
 SPACING_PX = 48
+"""Of the tiles, which overlap by a quarter."""
 BANDS_PER_PX = (0.055, 0.08, 0.11)
 """Bounds of the frequency rings, cycles per pixel: above the window's own width, below what H.264 quantises away."""
 SECTORS = 6
+"""Directions in which a ring is divided, 30° each."""
 SCENE_POWER = 2.5
 """Exponent with which a scene's power falls with frequency: 2 for natural texture, 3 for edges."""
 MAX_BACK_PX = 0.3

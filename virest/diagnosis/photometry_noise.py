@@ -25,6 +25,7 @@ _PLACES_PER_TERM = 3.0
 _PRIOR_COUNT = 6.0
 """Weight, in observations, of the frame's noise against that of the patch."""
 _LEAST_LEVELS = 0.05
+"""Least noise of a frame, grey levels: keeps the weights finite."""
 _PASSES = 4
 _SOLVER_STEPS = 60
 

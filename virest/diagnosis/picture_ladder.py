@@ -46,6 +46,7 @@ log = logging.getLogger(__name__)
 
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 MAX_RUNGS = 3
+"""Causes of brightness that may enter, one a rung."""
 WHOLE_LIGHT_FRAMES, MAX_LIGHT_FRAMES = 240, 130
 """Captures of up to the first number of frames are measured in every frame, longer ones in one run of the second number
 of frames, because patches are tracked from frame to frame."""
@@ -54,6 +55,7 @@ MAX_GAIN_FRAMES = 3000
 EQUAL_RANGE = 0.05
 """Runs whose 5 to 95 % ranges of log exposure × ISO agree to this determine the curve equally well."""
 MIN_OBSERVATIONS = 300
+"""Fewest observations of patches, each channel of each frame one, from which a cause is sought."""
 CURVE: dict[str, PhotometricEffect] = {"response_curve": ResponseGamma(), "black_level": BlackLevel()}
 MAX_CURVE_MEMORY = 0.45
 """Do not fit the curve if the encoder keeps more than this fraction of the last frame: it then keeps more of dark

@@ -32,7 +32,9 @@ STATED_STD = np.array([0.15, 0.02])
 UNKNOWN_STD = np.array([0.3, 0.04])
 """The same for an unknown curve, for which the default is used."""
 _STEP = 1e-3
+"""Finite-difference step of the logarithms of gamma and exposure, and of the black level."""
 _GAMMA, _BLACK = 0, 1
+"""Places in these vectors."""
 
 
 @dataclass(frozen=True, slots=True)

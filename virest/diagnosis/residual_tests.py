@@ -22,12 +22,15 @@ log = logging.getLogger(__name__)
 STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
 """Structure above this size, and above this fraction of the noise, has a cause."""
 STRUCTURE_P = 1e-4
+"""p value of a structure, and of excess noise: the eight tests of points together stay below FALSE_ALARM."""
 TRACKING_BIAS_PX = 0.02
+"""Mean residual that a tracker's own bias leaves in a bin."""
 SCALE_EXCESS = 1.25
 """Residuals above this many times their noise, measured without the model, and STRUCTURE_PX beyond it are not all
 noise."""
-LEAST_IN_PAIR = 8
-STRAY_DISTANCE = 6.0
+LEAST_IN_PAIR, STRAY_DISTANCE = 8, 6.0
+"""Pairs with at most this number of points are not tested; a point that far off, in standard deviations, is stray: of
+normal errors, 1 in 7e7 is."""
 HALF_WEIGHT_SIGMA = 40.0
 """Brightness residual with half weight, in robust σ: a band of the sensor is evidence, a passer-by is not."""
 PHOTOMETRIC_STRUCTURE = 1.5

@@ -51,14 +51,17 @@ Rectangle = tuple[int, int, int, int]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
 PAIRS = 4
+"""Pairs of frames that are restored: the cost is that of 16 frames."""
 KEPT_BACK = 0.1
 """Maximum fraction of the frames that is kept back from fits."""
 MIN_TRACKS = 16
 """Minimum number of points for aligning two pictures."""
 HOMOGRAPHY_PX = 2.0
+"""Points within this of the homography determine it."""
 EDGE_PX = 4
 """Margin excluded along the border of the valid area: half the reach of the gradient and of the interpolation."""
 PATCH_PX = 9
+"""Side of the square over which light is averaged at a point."""
 LIGHT_RANGE = (0.02, 0.9)
 """As fractions of the curve's full range; darker light is noise, brighter light may be clipped."""
 

@@ -14,6 +14,7 @@ from virest.arrays import Array, Index
 from virest.inference.chance import chi2_tail, normal_deviate, student_tail
 
 BINS = 10
+"""Bins of a covariate, with equally many residuals."""
 LEAST_IN_CELL = 4
 """Minimum number of residuals for a mean of one bin in one time block."""
 

@@ -22,7 +22,7 @@ from virest.diagnosis.picture_ladder import Reader
 from virest.image_formation.light import flicker
 from virest.image_formation.row_clock import RowClock
 from virest.inference import profile_terms as terms_of
-from virest.inference.coarse_alignment import align_coarsely, align_with_skew
+from virest.inference.coarse_alignment import MIN_MOTION_PX, align_coarsely, align_with_skew
 from virest.inference.frame_rotations import gyro_turns
 from virest.inference.frame_selection import high_motion_frames
 from virest.inference.observed_tracks import CELLS, ObservedTracks
@@ -36,7 +36,10 @@ WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240
 """Captures of up to the first number of frames (15 s at 30 frames per second) are tracked in every frame; longer ones
 in runs of frames whose total length is the second number."""
 MIN_PAIRS = 6
-MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
+"""Fewest pairs of frames; each is then a time block of its own: three to fit and three to judge."""
+MIN_EXPLAINED = 0.3
+"""Least part of the frames' rotation that the gyroscope must explain for a fit to start; below what `calibrate` needs
+(coarse_alignment.MIN_EXPLAINED), because the profile may be wrong."""
 AXIS_EXPLAINED = 0.6
 """Minimum squared correlation between the rotations of frames and gyroscope about one axis."""
 WELL_EXPLAINED = 0.98

@@ -47,13 +47,16 @@ STEP_S, NEAR_S, SEARCH_S = 0.008, 0.04, 1.0
 """Step of the offsets; range around the profile's offset, searched first; full range."""
 FINE_STEP_S = 0.002
 FALSE_ALARMS = 1e-3
+"""Probability that an unrelated log guides the tracking, if its support follows the rivals' distribution."""
 SAME_PX = 2.0
 """Logs whose predicted tile positions differ by less (rms) count as the same."""
 MIN_RIVALS = 20
+"""Fewest rivals, of at most 47, from which mean and deviation of the supports are taken."""
 BLOCK_PAIRS, BLOCK_SIGMA, LEAST_BLOCKS = 4, 2.0, 0.75
 """LEAST_BLOCKS of the blocks of BLOCK_PAIRS pairs must each support the gyroscope by BLOCK_SIGMA standard deviations of
 its rivals: a short part of a log may fit by chance, or be the only part of this recording."""
 GUMBEL_MEAN, GUMBEL_STD = 0.5772, 1.2825
+"""Of the standard Gumbel distribution: Euler's constant and π / √6."""
 
 
 def find_guide(capture: Capture, profile: CameraProfile, gray: Reader, frames: Sequence[int]) -> GyroGuide | None:

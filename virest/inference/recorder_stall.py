@@ -27,9 +27,11 @@ from virest.motion.trajectory import Trajectory
 CONTEXT = 8
 """Frames with correct timestamps on both sides of a stall, which determine the scatter of the rotations."""
 MIN_CONTEXT = 6
+"""Fewest of these whose rotations could be measured."""
 REPEAT_PX, MOVED_PX = 0.1, 0.5
 """A frame repeats its predecessor if points move less than REPEAT_PX where the gyroscope predicts over MOVED_PX."""
 LEAST_NOISE_PX = 0.1
+"""Least scatter of the rotations that is assumed, px at the focal length."""
 DECISIVE_CHI2 = 37.0
 """Smallest chi-square advantage of the best position over any other: exp(−37 / 2) is 1e-8, and 1e-6 if rotations
 scatter 15 % more than in the neighbouring frames."""

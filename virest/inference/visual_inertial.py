@@ -35,7 +35,9 @@ STRETCH_S = 14.0
 RUNS_PER_WINDOW, RUN_FRAMES = 4, 7
 """Frames to track: number of runs spread over each window, and consecutive frames in each."""
 POINTS_PER_WINDOW = 800
+"""Points that are fitted, thinned evenly."""
 MIN_POINTS = 200
+"""Fewest points of a stretch."""
 START_INVERSE_DEPTH_PER_M = 0.5
 """Start of every fit of translation: a scene 2 m away, as in rooms."""
 MAX_RELATIVE_STD = 0.1
@@ -52,7 +54,6 @@ MAX_UNEXPLAINED = 0.15
 MAX_SPREAD = 0.6
 """Largest spread of inverse depths about the plane relative to its inverse depth."""
 GRAVITY_TOLERANCE_M_S2 = 0.7
-MAX_ITERATIONS = 15
 ROTATION_ITERATIONS = 8
 """The fit with rotation alone serves only for comparison and needs no full convergence."""
 STATED_DEPTH_STD = 0.02
@@ -163,7 +164,7 @@ def _fit_stretch(
         return None
     inverse_depth = START_INVERSE_DEPTH_PER_M if depth_m is None else 1 / depth_m
     scene = start_scene(imu, known, table, inverse_depth)
-    fit = fit_tracks(imu, table, profile, terms, scene, known=known, max_iterations=MAX_ITERATIONS)
+    fit = fit_tracks(imu, table, profile, terms, scene, known=known)
     if depth_m is not None:
         fit = _at_depth(fit, imu, table, profile, terms, depth_m)
     assert isinstance(fit.scene, InertialMotion)
@@ -217,7 +218,7 @@ def _at_depth(
     held = replace(
         scene, velocity_m_s=scene.velocity_m_s / ratio, plane_per_m=plane, plane_std_per_m=(spread, spread, spread)
     )
-    return fit_tracks(imu, table, profile, terms, held, max_iterations=MAX_ITERATIONS)
+    return fit_tracks(imu, table, profile, terms, held)
 
 
 # ── judgement ────────────────────────────────────────────────────────────────────────────────────────────────────
