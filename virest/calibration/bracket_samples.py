@@ -20,14 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.arrays import Array, Mask
-from virest.calibration.grey_levels import (
-    CUT_SIGMA,
-    ChannelEnds,
-    GreyNoise,
-    channel_ends,
-    mean_noise,
-    pixel_noise,
-)
+from virest.calibration.grey_levels import CUT_SIGMA, ChannelEnds, GreyNoise, channel_ends, mean_noise, pixel_noise
 from virest.errors import CalibrationError
 
 MAX_SHIFT_PX = 8.0

@@ -126,12 +126,7 @@ def reset_undetermined(
 
 
 def value_of(
-    name: str,
-    given: CameraProfile,
-    profile: CameraProfile,
-    fitted: CameraProfile,
-    variance: Array,
-    determined: bool,
+    name: str, given: CameraProfile, profile: CameraProfile, fitted: CameraProfile, variance: Array, determined: bool
 ) -> CalibratedValue:
     """Build one value.  fitted: profile with all fitted values, used to convert relative deviations to units."""
     shown = calibrated(name)

@@ -413,12 +413,7 @@ def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names
 
 
 def _conclude(
-    imu: ImuSamples,
-    given: CameraProfile,
-    start: CameraProfile,
-    coarse: CoarseAlignment,
-    rough: _Rough,
-    joint: _Joint,
+    imu: ImuSamples, given: CameraProfile, start: CameraProfile, coarse: CoarseAlignment, rough: _Rough, joint: _Joint
 ) -> GeometryCalibration:
     """Assess and assemble the result."""
     fit, observed = joint.fit, joint.observed

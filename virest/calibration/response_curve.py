@@ -46,7 +46,7 @@ from virest.errors import CalibrationError, SettingsError
 MIN_RATIO, FEW_RATIO = 2**0.25, 2**1.5
 """Ratios of the largest to the smallest exposure: below 0.25 EV a bracket is refused, below 1.5 EV called weak."""
 MOVED_LEVELS, MAX_MOVED = 8.0, 0.2
-"""A sample that deviates by more, rms over the exposures, has moved; a scene in which a larger part has is not still."""
+"""A sample that deviates by more, rms over the exposures, has moved; a scene is still if at most this part has."""
 WORST_OF_MEDIAN = 3.0
 """A sample is excluded if its largest residual exceeds this multiple of the median over samples."""
 SCATTER_EV = 0.06
@@ -365,11 +365,7 @@ def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
 
 
 def _result(
-    pictures: Sequence[BracketPicture],
-    seen: Mask,
-    verdict: _Verdict,
-    samples: BracketSamples,
-    notes: list[str],
+    pictures: Sequence[BracketPicture], seen: Mask, verdict: _Verdict, samples: BracketSamples, notes: list[str]
 ) -> CurveFit:
     final = verdict.final
     log_t = np.log(samples.exposure) + LN2 * final.correction_ev

@@ -108,12 +108,7 @@ def as_exposure(findings: Sequence[Finding], change: ParameterChange) -> Finding
     )
 
 
-def merged(
-    moved: CameraProfile,
-    lit: CameraProfile,
-    blurred: CameraProfile,
-    is_exposure: bool,
-) -> CameraProfile:
+def merged(moved: CameraProfile, lit: CameraProfile, blurred: CameraProfile, is_exposure: bool) -> CameraProfile:
     """Combine all causes in one profile: geometry from ``moved``, photometry from ``lit``, blur from ``blurred``."""
     light = lit.extensions
     found = with_flicker_of(replace(moved, response=lit.response), lit).with_extensions(

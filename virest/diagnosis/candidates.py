@@ -88,12 +88,7 @@ def _median_residual_px(evidence: Evidence, model: Model, table: TrackTable) -> 
 
 
 def candidates_of(
-    evidence: Evidence,
-    nominal: CameraProfile,
-    model: Model,
-    tried: set[str],
-    lags: Sequence[Schedule],
-    far: FarStart,
+    evidence: Evidence, nominal: CameraProfile, model: Model, tried: set[str], lags: Sequence[Schedule], far: FarStart
 ) -> list[Candidate]:
     """All causes that are not in the model yet, each at all its starting points.
 

@@ -10,14 +10,7 @@ import numpy as np
 from virest.arrays import Array, Mask
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
-from virest.diagnosis.geometric_evidence import (
-    ITERATIONS,
-    Evidence,
-    Model,
-    capped_rms,
-    fit_model,
-    relief_loss,
-)
+from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, fit_model, relief_loss
 from virest.image_formation.point_model import TrackTable
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.parallel import ParallelMap

@@ -275,10 +275,7 @@ def _darkest(pictures: Sequence[Rgb]) -> float:
 
 
 def _compare(
-    sharp: tuple[Frame, Rgb],
-    blurred: tuple[Frame, Rgb],
-    camera: TurningCamera,
-    steps: dict[str, Array],
+    sharp: tuple[Frame, Rgb], blurred: tuple[Frame, Rgb], camera: TurningCamera, steps: dict[str, Array]
 ) -> list[Array]:
     """Pixels, noise, and for each effect stiffness, scores and rest, (12,) in all, of each usable tile of one pair."""
     height, width = blurred[1].shape[:2]

@@ -13,20 +13,11 @@ import numpy as np
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
-from virest.diagnosis.ambiguities import (
-    as_exposure,
-    exposure_hypothesis,
-    merged,
-    offset_as_timestamp,
-)
+from virest.diagnosis.ambiguities import as_exposure, exposure_hypothesis, merged, offset_as_timestamp
 from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.field.blur import blur_field
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
-from virest.diagnosis.field.brightness import (
-    instead_of_cause,
-    light_field,
-    with_light_field,
-)
+from virest.diagnosis.field.brightness import instead_of_cause, light_field, with_light_field
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal

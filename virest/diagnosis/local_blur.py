@@ -24,20 +24,8 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.diagnosis.isolated_steps import IsolatedSteps, isolated_steps, join_steps
-from virest.diagnosis.local_blur_edges import (
-    EdgeWidths,
-    evenly_isolated,
-    isolated_edges,
-    join_edges,
-    observe_picture,
-)
-from virest.diagnosis.local_blur_model import (
-    across,
-    fitted_width,
-    path_tensors,
-    predicted_ratios,
-    transfers,
-)
+from virest.diagnosis.local_blur_edges import EdgeWidths, evenly_isolated, isolated_edges, join_edges, observe_picture
+from virest.diagnosis.local_blur_model import across, fitted_width, path_tensors, predicted_ratios, transfers
 from virest.diagnosis.local_blur_spectra import (
     BANDS_PER_PX,
     MEMORY,

@@ -115,9 +115,7 @@ class Flicker:
         amplitude, frequency, phase = (float(v) for v in values)
         phase = float(np.mod(phase + (np.pi if amplitude < 0 else 0.0), 2 * np.pi))
         return profile.with_extensions(
-            flicker_amplitude=abs(amplitude),
-            flicker_frequency_hz=frequency,
-            flicker_phase_rad=phase,
+            flicker_amplitude=abs(amplitude), flicker_frequency_hz=frequency, flicker_phase_rad=phase
         )
 
 

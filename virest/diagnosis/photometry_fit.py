@@ -16,12 +16,7 @@ import numpy as np
 from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
-from virest.diagnosis.photometry import (
-    PhotometricObservations,
-    Prediction,
-    normalised_rms,
-    predict,
-)
+from virest.diagnosis.photometry import PhotometricObservations, Prediction, normalised_rms, predict
 from virest.diagnosis.photometry_effects import SEARCH_HZ, GainDrift, PhotometricEffect, flicker_change
 from virest.effects.table import EFFECTS
 from virest.inference.chance import chi2_tail, normal_deviate

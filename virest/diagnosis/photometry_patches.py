@@ -216,12 +216,7 @@ def _best_of_cells(score: NDArray[np.float32], cell: float) -> list[tuple[int, i
 # ── from frame to frame ────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _seen_patches(
-    key: _Key,
-    frame: Frame,
-    maps: _PatchMaps,
-    camera: TurningCamera | None,
-) -> Array:
+def _seen_patches(key: _Key, frame: Frame, maps: _PatchMaps, camera: TurningCamera | None) -> Array:
     """Read the patches of a key frame in another frame; empty if the frames cannot be registered."""
     field = _deviation(key.corners, frame, maps.normal, camera)
     if field is None:
@@ -333,10 +328,7 @@ def _read(key: _Key, points_px: Array, frame: Frame, maps: _PatchMaps) -> Array:
 
 
 def _observations(
-    table: Array,
-    frames: list[Frame],
-    profile: CameraProfile,
-    intra_frames: Collection[int],
+    table: Array, frames: list[Frame], profile: CameraProfile, intra_frames: Collection[int]
 ) -> PhotometricObservations:
     """One entry per channel; clipped entries and patches seen too rarely are dropped."""
     place, index = table[:, 0].astype(np.intp), table[:, 1].astype(np.intp)

@@ -66,11 +66,7 @@ def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0
 
 
 def seen_by_rows(
-    motion: CameraMotion,
-    points_px: Array,
-    at_s: Any,
-    anchor: float,
-    within_px: float = FIXED_POINT_PX,
+    motion: CameraMotion, points_px: Array, at_s: Any, anchor: float, within_px: float = FIXED_POINT_PX
 ) -> Array:
     """Positions in the picture of anchored rows of points seen at pixels (..., 2) at time ``at_s``.
 

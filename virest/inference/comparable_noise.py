@@ -13,13 +13,7 @@ from virest.image_formation.point_model import predict
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.track_fit import ANY_DEPTH, TrackFit
-from virest.inference.track_noise import (
-    ORDERS,
-    POINTS_PER_TERM,
-    REWEIGHTINGS,
-    flow_basis,
-    smooth_flow_residual,
-)
+from virest.inference.track_noise import ORDERS, POINTS_PER_TERM, REWEIGHTINGS, flow_basis, smooth_flow_residual
 from virest.inference.tracking import TrackPair
 from virest.motion.scene_motion import DirectedMotion
 

@@ -168,11 +168,7 @@ class Evidence(Protocol[S, L]):
 
 
 def descend(
-    evidence: Evidence[S, L],
-    state: S,
-    max_iterations: int = MAX_ITERATIONS,
-    look: L | None = None,
-    fresh: bool = True,
+    evidence: Evidence[S, L], state: S, max_iterations: int = MAX_ITERATIONS, look: L | None = None, fresh: bool = True
 ) -> System[S, L]:
     """Levenberg-Marquardt; the scale of the residuals is updated after each accepted step.
 
