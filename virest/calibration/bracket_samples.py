@@ -24,15 +24,19 @@ from virest.calibration.grey_levels import CUT_SIGMA, ChannelEnds, GreyNoise, ch
 from virest.errors import CalibrationError
 
 MAX_SHIFT_PX = 8.0
+"""Largest shift of a picture that is corrected."""
 MIN_GAIN = 0.2
 """Minimum fraction of the squared difference between two pictures that a shift must remove to be accepted."""
 RIGID_PX = 1.5
 """Maximum relative motion of the quarters of a picture."""
 MAX_LEVEL_SHARE = 4 / 256
 """Fraction of the pixels at one grey level above which ranks are compressed."""
-CANDIDATES = 9000
-SITES = 900
+CANDIDATES, SITES = 9000, 900
+"""Squares that are measured, and flat ones that are kept.  Half or twice as many change the curves of three simulated
+brackets by 0.1 grey level at most, and that of a dark one coded as JPEG by 0.5, either way; twice the sites lower the
+standard deviation by 3 %."""
 MIN_SITES = 40
+"""Fewest sites that determine a curve; three simulated brackets have more than 80."""
 PILE = 0.02
 """Minimum fraction of samples within the noise of the darkest or brightest grey for that grey to be a clip level."""
 ABOVE_PILE = 0.1

@@ -23,6 +23,7 @@ TRUSTED_EV = 0.02
 FREE_EV = 4.0
 """Prior standard deviation of a suspect listed exposure."""
 OUTLIER_LEVELS = 20.0
+"""Residuals are capped at this, grey levels, before kinds are compared; half or twice it changed no simulated fit."""
 WIDEST_EV = 20.0
 """Bound on exposure corrections; a camera's shutter range is smaller."""
 SMOOTH_WEIGHT = 5.0
