@@ -29,6 +29,7 @@ from virest.image_formation.row_clock import ROW_MIDDLE, ROW_START, RowClock
 _LOG_LIGHT = np.arange(-9.5, 0.75, 0.002)
 """Grid of the tabulated curve, natural logarithm of light."""
 _LIGHT_STEPS = 3
+"""Steps of a patch's light; 2 or 6 give the same values to 0.001 σ (simulated vignetting and flicker)."""
 _LEAST_SLOPE = 0.02
 """Grey levels per unit of log light below which an observation does not determine its light."""
 

@@ -26,8 +26,9 @@ _PRIOR_COUNT = 6.0
 """Weight, in observations, of the frame's noise against that of the patch."""
 _LEAST_LEVELS = 0.05
 """Least noise of a frame, grey levels: keeps the weights finite."""
-_PASSES = 4
-_SOLVER_STEPS = 60
+_PASSES, _SOLVER_STEPS = 4, 60
+"""Reweightings, and steps of each solution.  Twice as many change simulated vignetting and flicker by less than 0.15 σ,
+and their standard deviations by 5 % at most."""
 
 
 def measured_noise(observations: PhotometricObservations, curve: ResponseCurve) -> PhotometricObservations:
