@@ -38,9 +38,11 @@ NODES = 15
 MOST_SHIFT_PX = 0.3
 """Larger e are clipped to this: the first order holds for shifts that are small relative to a corner's detail."""
 LEAST_BLUR_PX = 0.3
+"""Points with less blur in both frames together have no bias."""
 LEAST_COMMON = 0.5
 """If a smaller fraction of the detail has the same sign in both frames, |Re| replaces Re, so that e stays finite."""
 POINTS_AT_ONCE = 2000
+"""Limits the memory: 80 frequencies and 15 nodes for each point take 10 kB."""
 
 
 def blur_bias_px(known: IntegratedMotion, table: TrackTable, guided: Mask) -> Array:

@@ -19,6 +19,7 @@ from virest.inference.frame_rotations import FrameRotations, gyro_turns
 from virest.motion.integration import integrate_gyro
 
 STEP_S = 0.004
+"""Of the searched offsets; half or twice changes no fit that starts there (two simulated captures)."""
 MIN_COVERED = 0.75
 """Smallest fraction of the pairs that must lie inside the inertial data."""
 PLANAR = 0.05
@@ -28,7 +29,9 @@ KEEP_PROFILE = 1.15
 MAX_PROFILE_LEFT = 0.3
 """Keep the profile's axes at the same offset if they leave less than this fraction unexplained."""
 SAME_VALLEY_S = 0.06
+"""Offsets of the profile's axes and of free ones that lie this close are the same."""
 SKEWS = (-0.0045, -0.003, -0.0015, 0.0015, 0.003, 0.0045)
+"""Changes of the clock skew that are tried: up to 13 ms over 3 s."""
 SKEW_GAIN = 0.8
 """Accept another clock rate if it leaves less than this fraction of what the profile's rate leaves unexplained."""
 SOFTENING = 3.0

@@ -19,7 +19,9 @@ from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
 
 PASSES = 3
+"""Gauss-Newton steps of a point near the plane; 2 give the same depths to 0.001 σ."""
 RELIEF_PASSES, RELIEF_REACH = 6, 3.0
+"""The same of points at any distance, and the largest change in one step, in inverse depths of the plane."""
 FARTHEST = 0.02
 """Inverse depths are clipped to at least this fraction of the plane's."""
 MAX_ACROSS = 4.0
@@ -29,6 +31,7 @@ QUOTIENT = 1e-3
 MAX_RELATIVE_STD = 0.5
 """Points with a larger relative standard deviation of the inverse depth are dropped."""
 MIN_POINTS = 20
+"""Fewest points of a frame that shift its plane from its window's."""
 NEAR_S = 1.0
 """A frame uses points seen within this time of it."""
 OUTSIDE = 0.05

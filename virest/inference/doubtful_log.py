@@ -19,6 +19,7 @@ STRAIGHT_PART = 0.03
 CHANCE = 1e-6
 """False-alarm probability of a straight run in the log, from the rate of such differences on the three axes."""
 LEAST_STRAIGHT_S = 0.02
+"""Shortest straight run that is doubted."""
 PILE_PART, LEAST_PILED, PILED_RUN = 0.005, 6, 3
 """Readings within PILE_PART of the largest are at the limit; clipping needs LEAST_PILED of them in all, with a run of
 PILED_RUN."""

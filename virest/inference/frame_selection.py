@@ -17,6 +17,7 @@ from virest.capture.join import median_period_s
 from virest.capture.records import Frame
 
 RUN_S, MIN_RUN_FRAMES, MAX_RUN_FRAMES = 1.5, 20, 80
+"""Length of a run, and its bounds at low and high frame rates."""
 
 
 def high_motion_frames(

@@ -31,6 +31,7 @@ NODES = 8
 ROW_STEPS = 3
 """Row times depend on where a point lands; each step reduces the error about tenfold at 250 px per frame."""
 INVERSE_STEPS, INVERSE_PX = 12, 1e-3
+"""Most steps of the inverse map, which end when a step is shorter than this."""
 LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 1.0, 0.2, 2.0
 """Smallest σ of blur that is applied; smallest σ of the Gaussian across the path; its extent in σ."""
 

@@ -46,6 +46,7 @@ FLAT_LEVELS = 1.5
 STEP_S, NEAR_S, SEARCH_S = 0.008, 0.04, 1.0
 """Step of the offsets; range around the profile's offset, searched first; full range."""
 FINE_STEP_S = 0.002
+"""Step of the offsets about the best one."""
 FALSE_ALARMS = 1e-3
 """Probability that an unrelated log guides the tracking, if its support follows the rivals' distribution."""
 SAME_PX = 2.0

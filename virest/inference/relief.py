@@ -54,6 +54,7 @@ REWEIGHTINGS = 1
 STD_STEP = 6
 """Standard deviations are computed at every such node."""
 JUDGED_INSTANTS, MIN_JUDGED_CELLS = 4, 12
+"""Frames at which a surface is judged, and fewest cells with points in them."""
 LEAST_SIGMA, LEAST_GAIN = 3.0, 0.1
 """A surface must reduce the residuals of held-out points by this many standard errors and by this fraction."""
 
