@@ -55,7 +55,8 @@ from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 log = logging.getLogger(__name__)
 
 FEW_POINTS, MANY_POINTS = 2000, 7000
-"""Points of the fits for the readout's axis, and of the joint fit."""
+"""Points of the fits for the readout's axis, and of the joint fit.  Half of the latter moves values by 1 σ at most and
+widens σ 1.2 times; twice narrows it by 5 %."""
 EXPLAINED_SCALE = 1.15
 """Whitened residuals with a scale below this need no translation."""
 TRANSLATION_GAIN = 0.97

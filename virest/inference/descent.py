@@ -25,9 +25,11 @@ from virest.arrays import Array
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
 MAX_ITERATIONS = 15
+"""A descent ends here if it has not converged."""
 CONVERGED = 0.02
 """The fit ends when the rms of a step, in the values' standard deviations, is below this."""
 FIRST_DAMPING, MAX_DAMPING = 1e-3, 1e3
+"""Damping after the first step that raises the loss, and where a descent gives up; half or twice changed no fit."""
 
 
 class Slopes(Enum):

@@ -13,6 +13,8 @@ from virest.arrays import Array, Index
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, cauchy_weight
 
 FIRST_PASSES, LATER_PASSES = 12, 4
+"""Passes from an unknown direction, and from one of an earlier pass; half or twice as many change a time offset by
+less than 0.01 σ, and its standard deviation by 9 % at most."""
 _UPPER = np.triu_indices(3)
 
 

@@ -35,7 +35,8 @@ STRETCH_S = 14.0
 RUNS_PER_WINDOW, RUN_FRAMES = 4, 7
 """Frames to track: number of runs spread over each window, and consecutive frames in each."""
 POINTS_PER_WINDOW = 800
-"""Points that are fitted, thinned evenly."""
+"""Points that are fitted, thinned evenly; half or twice as many change a simulated depth by 0.5 σ, and twice lowers its
+standard deviation by a fifth."""
 MIN_POINTS = 200
 """Fewest points of a stretch."""
 START_INVERSE_DEPTH_PER_M = 0.5
