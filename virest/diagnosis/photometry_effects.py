@@ -201,7 +201,7 @@ class FlickerScan:
     power: Array
     """Reduction of the weighted sum of squares; for noise alone, chi-squared with two degrees of freedom."""
     amplitude: Array
-    """Of the light, corrected for averaging over the exposure; 0 where nothing is left after averaging."""
+    """Of the light, before the averaging over exposures; 0 where that leaves nothing."""
     phase_rad: Array
 
     def peaks(self, count: int) -> list[int]:
@@ -230,18 +230,26 @@ def scan_flicker(observations: PhotometricObservations, profile: CameraProfile) 
     time_s = observations.row_time_s(profile, ROW_MIDDLE)[keep]
     span = max(float(np.ptp(time_s)), 0.1)
     frequency = np.arange(*SEARCH_HZ, _SCAN_STEP_CYCLES / span)
-    coefficients, power = _sines(observations.patch[keep], relative[keep], stiffness[keep], time_s, frequency)
-    left = np.sinc(frequency * np.median(exposure))
-    whole = np.where(np.abs(left) > _LEAST_SINC, left, np.inf)
-    complex_amplitude = (coefficients[:, 0] + 1j * coefficients[:, 1]) / whole
-    return FlickerScan(frequency, power * thin, np.abs(complex_amplitude), np.angle(complex_amplitude))
+    coefficients, power = _sines(
+        observations.patch[keep], relative[keep], stiffness[keep], time_s, exposure[keep], frequency
+    )
+    left = np.abs(np.sinc(frequency[:, None] * np.unique(exposure[keep]))).max(axis=1)
+    amplitude = np.where(left > _LEAST_SINC, np.linalg.norm(coefficients, axis=-1), 0.0)
+    return FlickerScan(frequency, power * thin, amplitude, np.arctan2(coefficients[:, 1], coefficients[:, 0]))
 
 
-def _sines(patch: Any, values: Array, stiffness: Array, time_s: Array, frequency: Array) -> tuple[Array, Array]:
-    """(coefficients (m, 2) of sin and cos at each frequency, power (m,) that they explain); patch means are removed."""
+def _sines(
+    patch: Any, values: Array, stiffness: Array, time_s: Array, exposure_s: Array, frequency: Array
+) -> tuple[Array, Array]:
+    """(coefficients (m, 2) of sin and cos at each frequency, power (m,) that they explain); patch means are removed.
+
+    Each exposure averages a sine by its own factor: with one factor for all, exposures that repeat every few frames
+    would put the power into aliases.
+    """
     dense = np.unique(patch, return_inverse=True)[1]
     order = np.argsort(dense, kind="stable")
-    dense, values, stiffness, time_s = dense[order], values[order], stiffness[order], time_s[order]
+    dense, values, stiffness = dense[order], values[order], stiffness[order]
+    time_s, exposure_s = time_s[order], exposure_s[order]
     start = np.flatnonzero(np.diff(dense, prepend=-1))
     total = np.add.reduceat(stiffness, start)
     root = np.sqrt(stiffness)
@@ -250,7 +258,8 @@ def _sines(patch: Any, values: Array, stiffness: Array, time_s: Array, frequency
     turn = np.exp(2j * np.pi * (frequency[1] - frequency[0]) * time_s)
     fit, power = np.zeros((len(frequency), 2)), np.zeros(len(frequency))
     for i in range(len(frequency)):
-        column = root * (wave - (np.add.reduceat(stiffness * wave, start) / total)[dense])
+        seen = np.sinc(frequency[i] * exposure_s) * wave
+        column = root * (seen - (np.add.reduceat(stiffness * seen, start) / total)[dense])
         sine, cosine = column.imag, column.real
         a, b, c = sine @ sine, sine @ cosine, cosine @ cosine
         p, q = sine @ right, cosine @ right
