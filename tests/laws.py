@@ -19,6 +19,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
 from virest.image_formation.row_motion import FrameTranslation, RowMotion, row_motion
+from virest.image_formation.warp import seen_by_rows
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
@@ -182,3 +183,23 @@ def psnr_db(picture: Array, truth: Array, border: int = 0) -> float:
     inner = (slice(border, -border or None),) * 2
     error = np.asarray(picture, float)[inner] - np.asarray(truth, float)[inner]
     return float(10 * np.log10(255.0**2 / np.mean(error**2)))
+
+
+def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0) -> Array:
+    """Recorded positions of points of the picture at the reference time."""
+    return seen_by_rows(motion, points_px, motion.reference_s, anchor)
+
+
+class AtDepth:
+    """A motion before points of these inverse depths, 1/m, in the axes in which they are looked at first."""
+
+    def __init__(self, motion: RowMotion, inverse_depth: Array | float) -> None:
+        self.motion, self.nearness = motion, np.asarray(inverse_depth, float)
+
+    def __getattr__(self, name: str) -> Any:
+        """Everything else is the motion's."""
+        return getattr(self.motion, name)
+
+    def inverse_depth(self, rays: Array, time_s: Any) -> Array:
+        """The same at any time."""
+        return np.broadcast_to(self.nearness, rays.shape[:-1])

@@ -19,7 +19,7 @@ from virest.app.cli import app
 from virest.app.gallery import CASES
 from virest.app.settings import settings_model
 from virest.camera import profile_schema
-from virest.diagnosis.catalogue import CATALOGUE
+from virest.effects.table import EFFECTS
 
 TEXT = "\n".join(map(read, PAGES))
 PROGRAM: Any = typer.main.get_command(app)
@@ -130,7 +130,7 @@ def test_every_profile_and_settings_key_is_documented() -> None:
 
 def test_every_effect_is_documented_and_in_the_gallery() -> None:
     """Each effect has its line in the profile's table and its section in the gallery, with a picture that is there."""
-    for name in CATALOGUE:
+    for name in EFFECTS:
         assert f"| `{name}` |" in read(DOCS / "profile.md")
     for name in CASES:
         assert re.search(rf"^## {name}$", read(DOCS / "gallery.md"), re.MULTILINE), name

@@ -51,7 +51,7 @@ def seen(added_px: Array | float, seed: int = 5) -> tuple[BlurObservations, Capt
     logged = tuple(Frame(k, 0, float(t), 0.004, focus_dioptres=float(focus_dioptres(t))) for k, t in enumerate(STAMPS))
     nowhere = Path("nowhere")
     capture = Capture("edges", nowhere, nowhere, 640, 480, logged, STILL, CaptureMetadata(), "REALTIME", 0)
-    return BlurObservations(edges, join_ratios([]), 20 * count, count), capture
+    return BlurObservations(edges, join_ratios([]), count), capture
 
 
 STAMPS = np.arange(FRAMES) / 15

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pickle
 
-from virest.diagnosis.catalogue import CATALOGUE
 from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.local_blur_fit import Defocus, ExposureTime
 from virest.diagnosis.photometry_effects import BlackLevel, Flicker, ResponseGamma, Vignetting
+from virest.effects.table import EFFECTS as CATALOGUE
 from virest.simulation.effects import EFFECTS
 
 SPECIAL = {"scene_depth", "frame_lag"}

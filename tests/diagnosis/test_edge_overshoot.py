@@ -9,7 +9,6 @@ from scipy.special import ndtr
 
 from virest.app.diagnose import Source, open_source
 from virest.app.simulate import simulate_command
-from virest.diagnosis.catalogue import MAX_P
 from virest.diagnosis.edge_overshoot import (
     GRID_PX,
     EdgeProfiles,
@@ -19,6 +18,7 @@ from virest.diagnosis.edge_overshoot import (
     sharpened_step,
 )
 from virest.diagnosis.picture_ladder import PictureVerdict, climb_blur
+from virest.diagnosis.selection import MAX_P
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 from virest.simulation.phone_isp import PhoneIsp

@@ -22,7 +22,6 @@ from virest.diagnosis import (
     picture_ladder,
 )
 from virest.diagnosis.candidates import Candidate
-from virest.diagnosis.catalogue import CATALOGUE, FALSE_ALARM, MAX_P
 from virest.diagnosis.cross_validation import Judged, Screened, choose
 from virest.diagnosis.cross_validation import judge as judge_points
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain, ParameterChange, Rung
@@ -32,7 +31,8 @@ from virest.diagnosis.geometric_ladder import Trial, _best_single
 from virest.diagnosis.geometric_significance import significant
 from virest.diagnosis.photometry_effects import Flicker, GainDrift, Vignetting
 from virest.diagnosis.photometry_fit import fit_photometry, judge, time_blocks
-from virest.diagnosis.selection import Levels
+from virest.diagnosis.selection import FALSE_ALARM, MAX_P, Levels
+from virest.effects.table import EFFECTS
 from virest.inference import profile_terms as terms_of
 from virest.inference.descent import Residuals, System
 from virest.inference.parallel import one_by_one
@@ -200,7 +200,7 @@ def test_causes_that_the_blocks_do_not_tell_apart_are_rivals(monkeypatch: pytest
 
 def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
     """One in a thousand is too likely for one of twenty-two causes; for a word its gain by blocks decides."""
-    assert MAX_P * len(CATALOGUE) == pytest.approx(FALSE_ALARM)
+    assert MAX_P * len(EFFECTS) == pytest.approx(FALSE_ALARM)
     camera, evidence = hand()
     model = Model(camera.profile, None, ())
     candidate = Candidate("time_offset", model, (terms_of.TIME_OFFSET,), EFFECT["time_offset"])

@@ -12,7 +12,7 @@ from diagnosis.test_photometry import FRAMES, NOMINAL, hidden, made_observations
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.shutter import Shutter
 from virest.diagnosis import local_blur, local_blur_fit
-from virest.diagnosis.ambiguities import as_exposure, exposed, exposure_hypothesis
+from virest.diagnosis.ambiguities import as_exposure, exposure_hypothesis
 from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_findings import with_depth_of
 from virest.diagnosis.local_blur_fit import BlurFit
@@ -149,7 +149,6 @@ def test_an_offset_as_an_exposure_is_counted_from_the_profile(stamp: str, share:
     assert (change.nominal, change.estimate, change.std) == pytest.approx((0.8, 1.2, 0.01))
     finding = as_exposure([offset], change)
     assert finding.parameters == {"exposure_scale": change}
-    assert exposed(given, change.estimate).shutter.exposure_scale == change.estimate
 
 
 def test_no_exposure_shifts_rows_stamped_at_its_middle() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from virest.camera.shutter import Shutter
 from virest.capture.folder import read_capture
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.capture.video import GrayReader, probe_movie, read_gray
+from virest.capture.video import GrayReader, probe_movie
 from virest.diagnosis import local_blur
 from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.local_blur import (
@@ -26,7 +27,6 @@ from virest.diagnosis.local_blur import (
     frames_to_read,
     look_for_blur,
     look_for_steps,
-    observe_blur,
     residuals,
 )
 from virest.diagnosis.local_blur_edges import (
@@ -42,7 +42,7 @@ from virest.diagnosis.local_blur_fit import EDGE_STD, Defocus, ExposureTime, fit
 from virest.diagnosis.local_blur_model import fitted_width, node_tensors
 from virest.image_formation.kernels import kernel_field
 from virest.image_formation.row_motion import row_motion
-from virest.inference.edges import EdgeSettings
+from virest.inference.edges import EdgeSettings, find_edges
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
@@ -59,8 +59,10 @@ def observed(folder: Path, seed: int, *effects: str, bits_per_px: float = 0.5) -
     capture = read_capture(folder, look_at_pictures=False)
     profile = read_profile(folder / "camera.yaml")
     trajectory = integrate_gyro(capture.imu, profile)
-    pictures = read_gray(capture.movie, probe_movie(capture.movie), frames_to_read(capture, pairs=11))
-    return observe_blur(pictures, capture, profile, trajectory), profile, trajectory
+    gray = GrayReader(capture.movie, probe_movie(capture.movie))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(local_blur, "frames_to_read", partial(frames_to_read, pairs=11))
+        return look_for_blur(gray, capture, profile, trajectory), profile, trajectory
 
 
 @pytest.fixture(scope="module")
@@ -108,11 +110,12 @@ def test_parts_of_a_capture_show_what_all_of_it_shows(
     monkeypatch.setattr(local_blur, "frames_to_read", lambda capture: [3, 5, 7, 8, 9, 12])
     capture, (_, profile, trajectory) = read_capture(nominal_folder, look_at_pictures=False), nominal
     gray = GrayReader(capture.movie, probe_movie(capture.movie))
-    whole = observe_blur(gray([3, 5, 7, 8, 9, 12]), capture, profile, trajectory)
     parts = look_for_blur(gray, capture, profile, trajectory)
+    monkeypatch.setattr(local_blur, "PARTS", 1)
+    whole = look_for_blur(gray, capture, profile, trajectory)
     np.testing.assert_array_equal(parts.edges.width_px, whole.edges.width_px)
     np.testing.assert_array_equal(parts.ratios.log_ratio, whole.ratios.log_ratio)
-    assert parts.candidates == whole.candidates
+    assert parts.edges.candidates == whole.edges.candidates
     assert len(whole.ratios) > 0
 
 
@@ -152,7 +155,7 @@ def test_lines_and_waves_are_no_steps() -> None:
     line = np.exp(-0.5 * (u / 1.5) ** 2)
     wave = np.sin(2 * np.pi * u / 9)
     step = erf(u / (np.sqrt(2) * 1.7))
-    found = measure_widths(np.stack([line, wave, step]), 0.02)
+    found = measure_widths(np.stack([line, wave, step]))
     steps = found.width_px > 0
     assert set(found.row[steps]) == {2}
     np.testing.assert_allclose(found.width_px[steps], 1.7, rtol=0.01)
@@ -163,7 +166,7 @@ def crowded(rng: np.random.Generator, width_px: float) -> EdgeWidths:
     u, beside = np.arange(-19, 19.01, 0.5), 8.0 + 6.0 * rng.exponential(1.0, 3000)
     own = width_px * np.exp(rng.normal(0, 0.15, 3000))[:, None]
     steps = erf(u / (np.sqrt(2) * own)) - 0.7 * erf((u - beside[:, None]) / (np.sqrt(2) * own))
-    fit = measure_widths(steps + rng.normal(0, 0.004, steps.shape), 0.02)
+    fit = measure_widths(steps + rng.normal(0, 0.004, steps.shape))
     one, two = np.ones(len(fit.row)), np.zeros((len(fit.row), 2))
     return EdgeWidths(
         np.zeros(len(one), np.intp), one, one, two, two, fit.row, fit.reach_px, fit.width_px, one, one, len(steps)
@@ -244,7 +247,7 @@ def test_the_profile_alone_carries_the_effects(altered: Observed) -> None:
     true = Defocus().apply(ExposureTime().apply(profile, np.array([1.5])), np.array([1.3]))
     plain, right = (residuals(observations, p, trajectory) for p in (profile, true))
     edge = observations.is_edge
-    assert len(plain) == len(observations) == len(observations.covariates(profile, trajectory)["row"])
+    assert len(plain) == len(observations)
     assert np.median(np.abs(right[edge])) < 0.4 * np.median(np.abs(plain[edge]))
     assert np.median(np.abs(right[~edge])) < np.median(np.abs(plain[~edge]))
 
@@ -254,9 +257,9 @@ def test_a_scene_of_smooth_things_is_not_called_defocused(rng: np.random.Generat
     texture = cv2.GaussianBlur(rng.normal(size=(336, 448)), (0, 0), 3.0)
     picture = np.clip(120 + 45 * texture / texture.std(), 1, 250).astype(np.uint8)
     frame = Frame(0, 0, 0.0, 0.01)
-    edges = isolated_edges(observe_picture(picture, frame, ResponseCurve("srgb"), EdgeSettings()))
+    edges = isolated_edges(observe_picture(picture, frame, ResponseCurve("srgb"), *find_edges(picture, EdgeSettings())))
     observations, profile, trajectory = altered
-    smooth = replace(observations, edges=edges, candidates=edges.candidates, isolated=len(edges))
+    smooth = replace(observations, edges=edges, isolated=len(edges))
     assert edges.candidates > 100
     found = fit(smooth, profile, trajectory, [Defocus()])
     assert found.determined == (False,)

@@ -57,11 +57,16 @@ NOMINAL = CameraProfile(
 
 
 def made_observations(
-    true: CameraProfile, rng: np.random.Generator, products: float = 0.0, pace: float = 0.4
+    true: CameraProfile,
+    rng: np.random.Generator,
+    products: float = 0.0,
+    pace: float = 0.4,
+    exposures_s: tuple[float, ...] = (0.007,),
 ) -> PhotometricObservations:
     """Patches that wander through the picture, their grey written down from the contract's model.
 
-    products: spread of the logged exposure × ISO, in log light.  pace: of its walk, radians a frame.
+    products: spread of the logged exposure × ISO, in log light.  pace: of its walk, radians a frame.  exposures_s: of
+    the frames, in turn.
     """
     patches = 150
     frame = np.tile(np.arange(FRAMES), patches)
@@ -72,9 +77,9 @@ def made_observations(
     log_product = products * np.sin(pace * frame + 0.3)
     fraction = 1 - (at[:, 1] + 1) / 480
     radius = np.hypot(at[:, 0] - 319.5, at[:, 1] - 239.5) / 400.0
-    ext, exposure = true.extensions, 0.007
+    ext, exposure = true.extensions, np.resize(exposures_s, FRAMES)[frame]
     time = frame / 29.7 + 0.002 + fraction * 0.018
-    fine = time[:, None] + exposure * (np.arange(64) + 0.5) / 64
+    fine = time[:, None] + exposure[:, None] * (np.arange(64) + 0.5) / 64
     wave = 1 + ext.flicker_amplitude * np.sin(2 * np.pi * ext.flicker_frequency_hz * fine + ext.flicker_phase_rad)
     light = light * np.exp(log_product) * wave.mean(axis=1) * (1 - ext.vignetting_corner_loss * radius**2)
     light = light * np.array(ext.gain or np.ones(FRAMES))[frame]
@@ -84,7 +89,7 @@ def made_observations(
     grey += NOISE * rng.normal(size=len(grey))
     return PhotometricObservations(
         3 * patch, frame, frame / 29.7, fraction, at[:, 0], at[:, 1], radius, grey, np.full(len(grey), NOISE),
-        np.full(len(grey), exposure), log_product, np.zeros(len(grey)), frame == 0, True, 640, 480,
+        exposure, log_product, np.zeros(len(grey)), frame == 0, True, 640, 480,
     )  # fmt: skip
 
 
@@ -245,6 +250,15 @@ def test_flicker_that_the_exposure_averages_away_is_not_found(rng: np.random.Gen
     observed = made_observations(hidden(flicker_amplitude=0.4, flicker_frequency_hz=1 / 0.007), rng)
     fit = fit_photometry(observed, NOMINAL, [Flicker()])
     assert significance(fit, "flicker", observed, NOMINAL)[1] > 1e-3
+
+
+@pytest.mark.parametrize("exposures_s", [(0.013, 0.008, 0.010), (0.012, 0.007)])
+def test_exposures_in_turn_do_not_lead_flicker_astray(exposures_s: tuple[float, ...], rng: np.random.Generator) -> None:
+    """Each averages the light by its own factor, of either sign: the rhythm of the exposures is none of the lamp's."""
+    lamp = hidden(flicker_amplitude=0.3, flicker_frequency_hz=120.0, flicker_phase_rad=2.0)
+    fit = fit_photometry(made_observations(lamp, rng, exposures_s=exposures_s), NOMINAL, [Flicker()])
+    assert fit.values[1] == pytest.approx(120.0, abs=0.02)
+    assert abs(fit.values[0]) == pytest.approx(0.3, abs=0.02)
 
 
 def test_the_memory_of_an_encoder_does_not_weaken_flicker(rng: np.random.Generator) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from laws import FISHEYE, RADTAN, UNDISTORTED, TurningCamera, phone
+from laws import FISHEYE, RADTAN, UNDISTORTED, AtDepth, TurningCamera, phone
 from numpy.typing import NDArray
 
 from virest.camera.shutter import READOUT_DIRECTIONS
@@ -51,7 +51,7 @@ def test_chords_belong_to_the_exposure_of_their_own_row(direction: str) -> None:
     motion = camera.motion
     start_s = camera.row_start_s(CENTRES, motion.start_s)
     expected = camera.seen(CENTRES, start_s, start_s + 0.012, motion.reference_s, depth_m=1.3) - CENTRES
-    np.testing.assert_allclose(blur_chords(motion, CENTRES, 1 / 1.3), expected, atol=1e-3)
+    np.testing.assert_allclose(blur_chords(AtDepth(motion, 1 / 1.3), CENTRES), expected, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_before_relief_each_path_is_worked_out() -> None:
 def test_paths_with_depth_carry_the_shift() -> None:
     """With a global shutter and depth, a sideways shift v over the exposure e blurs by f v e / Z."""
     camera = TurningCamera(phone(readout_time_s=0.0), rate_rad_s=(0, 0, 0), velocity_m_s=(0.7, 0, 0))
-    field = kernel_field(camera.motion, CENTRES[1:2], 0.0, 1 / 2.0)
+    field = kernel_field(AtDepth(camera.motion, 1 / 2.0), CENTRES[1:2], 0.0)
     count = field.paths_px.shape[1]
     expected = 220 * 0.7 * 0.012 / 2.0 * (np.arange(count) + 0.5) / count
     np.testing.assert_allclose(field.paths_px[0, :, 0], expected, atol=1e-4)

@@ -28,12 +28,12 @@ def test_the_mean_flicker_of_a_row_is_the_mean_over_its_exposure() -> None:
     """Each row's factor is the mean of 1 + a sin(2π f t + φ) over [start, start + exposure] of that row."""
     profile = extended(flicker_amplitude=0.3, flicker_frequency_hz=100.0, flicker_phase_rad=0.7)
     motion = TurningCamera(profile, exposure_s=0.013).motion
-    instants = motion.row_start_s(PIXELS)[:, None] + (np.arange(4000) + 0.5) / 4000 * 0.013
+    instants = motion.row_time_s(PIXELS, 0.0)[:, None] + (np.arange(4000) + 0.5) / 4000 * 0.013
     expected = (1 + 0.3 * np.sin(2 * np.pi * 100 * instants + 0.7)).mean(axis=1)
     np.testing.assert_allclose(row_light(motion, PIXELS), expected, atol=1e-7)
     assert np.ptp(expected) > 0.02
     short = TurningCamera(profile, exposure_s=None).motion
-    at_once = 1 + 0.3 * np.sin(2 * np.pi * 100 * short.row_start_s(PIXELS) + 0.7)
+    at_once = 1 + 0.3 * np.sin(2 * np.pi * 100 * short.row_time_s(PIXELS, 0.0) + 0.7)
     np.testing.assert_allclose(row_light(short, PIXELS), at_once, atol=1e-12)
 
 
@@ -126,7 +126,7 @@ def test_flicker_weights_the_instants_of_a_path() -> None:
     centre = np.array([[104.0, 63.92]])
     field = kernel_field(motion, centre, 0.0)
     part = (np.arange(field.paths_px.shape[1]) + 0.5) / field.paths_px.shape[1]
-    light = 1 + 0.8 * np.sin(2 * np.pi * 20 * (motion.row_start_s(centre)[0] + part * motion.exposure_s) + 0.2)
+    light = 1 + 0.8 * np.sin(2 * np.pi * 20 * (motion.row_time_s(centre, 0.0)[0] + part * motion.exposure_s) + 0.2)
     expected = (field.paths_px[0, :, 0] * light).sum() / light.sum()
     kernel = field.arrays()[0]
     assert kernel.sum() == pytest.approx(1, abs=1e-5)

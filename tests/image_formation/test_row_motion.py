@@ -175,7 +175,7 @@ def test_rows_start_at_their_own_times(direction: str) -> None:
     camera = TurningCamera(phone(readout_direction=direction))
     points = np.array([[0, 0], [199, 135], [37, 101], [-5, 140]], float)
     motion = camera.motion
-    np.testing.assert_allclose(motion.row_start_s(points), camera.row_start_s(points, motion.start_s), atol=1e-12)
+    np.testing.assert_allclose(motion.row_time_s(points, 0.0), camera.row_start_s(points, motion.start_s), atol=1e-12)
 
 
 def test_the_table_follows_a_shaking_hand() -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from laws import FISHEYE, RADTAN, UNDISTORTED, TurningCamera, phone
+from laws import FISHEYE, RADTAN, UNDISTORTED, AtDepth, TurningCamera, phone, recorded_points
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +17,6 @@ from virest.image_formation.warp import (
     corner_points,
     dense_map,
     moved_between,
-    recorded_points,
     seen_by_rows,
     straightened_points,
 )
@@ -65,7 +64,7 @@ def test_points_with_depth_are_projected_points(lens: tuple[str, tuple[float, ..
     motion, points = camera.motion, _points()
     from_s, to_s = motion.start_s + 0.003, motion.start_s + 0.029
     expected = camera.seen(points, from_s, to_s, motion.reference_s, depth_m=1.7)
-    np.testing.assert_allclose(moved_between(motion, points, from_s, to_s, 1 / 1.7), expected, atol=1e-3)
+    np.testing.assert_allclose(moved_between(AtDepth(motion, 1 / 1.7), points, from_s, to_s), expected, atol=1e-3)
     at_infinity = camera.seen(points, from_s, to_s, motion.reference_s)
     np.testing.assert_allclose(moved_between(motion, points, from_s, to_s), at_infinity, atol=1e-5)
     assert np.abs(expected - at_infinity).max() > 0.5
@@ -75,8 +74,10 @@ def test_each_point_may_have_its_own_depth() -> None:
     """A list of inverse depths moves each point as it would move alone."""
     motion, points = TurningCamera(phone(), velocity_m_s=(0.4, -0.25, 0.6)).motion, _points()[:3]
     inverse_depth = np.array([0.0, 0.4, 1.5])
-    together = straightened_points(motion, points, 0.5, inverse_depth)
-    alone = [straightened_points(motion, p[None], 0.5, d)[0] for p, d in zip(points, inverse_depth, strict=True)]
+    together = straightened_points(AtDepth(motion, inverse_depth), points, 0.5)
+    alone = [
+        straightened_points(AtDepth(motion, d), p[None], 0.5)[0] for p, d in zip(points, inverse_depth, strict=True)
+    ]
     np.testing.assert_allclose(together, alone, atol=1e-12)
 
 
@@ -101,7 +102,7 @@ def test_straightened_points_are_explicit_projections(direction: str, anchor: fl
     motion, points = camera.motion, _points()
     at = camera.row_start_s(points, motion.start_s) + anchor * 0.012
     expected = camera.seen(points, at, motion.reference_s, motion.reference_s, depth_m=2.0)
-    np.testing.assert_allclose(straightened_points(motion, points, anchor, 0.5), expected, atol=1e-3)
+    np.testing.assert_allclose(straightened_points(AtDepth(motion, 0.5), points, anchor), expected, atol=1e-3)
     far = camera.seen(points, at, motion.reference_s, motion.reference_s)
     np.testing.assert_allclose(straightened_points(motion, points, anchor), far, atol=1e-5)
 
@@ -196,7 +197,7 @@ def test_points_of_the_frames_plane_move_as_points_in_space(lens: tuple[str, tup
     np.testing.assert_allclose(moved_between(motion, there, at_s, motion.reference_s), points, atol=1e-6)
     straight = straightened_points(motion, recorded_points(motion, points, 0.5), 0.5)
     np.testing.assert_allclose(straight, points, atol=1e-4)
-    assert np.abs(there - moved_between(motion, points, motion.reference_s, at_s, 0.0)).max() > 1.0
+    assert np.abs(there - moved_between(AtDepth(motion, 0.0), points, motion.reference_s, at_s)).max() > 1.0
 
 
 def test_the_stabiliser_holds_the_picture() -> None:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from virest.diagnosis.catalogue import CATALOGUE
+from virest.effects.table import EFFECTS
 from virest.report.charts import MAX_ARROWS, MAX_COLUMNS, arrow_field, band, nice_ticks, thinned, time_chart
 from virest.report.html import (
     CaptureRecord,
@@ -101,7 +101,7 @@ def test_the_policy_names_the_pages_own_style_and_script_and_nothing_else():
 
 def test_every_cause_has_words():
     """A cause that a diagnosis can name is told in plain words, and no others are."""
-    assert CAUSE_WORDS.keys() == CATALOGUE.keys()
+    assert CAUSE_WORDS.keys() == EFFECTS.keys()
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from blurred_scene import camera
-from laws import RADTAN, TurningCamera, phone
+from laws import RADTAN, TurningCamera, phone, recorded_points
 from numpy.typing import NDArray
 
-from virest.image_formation.warp import corner_points, recorded_points, straightened_points
+from virest.image_formation.warp import corner_points, straightened_points
 from virest.restoration.shutter import perspective_map, rowwise_map, valid_rectangle, warp
 
 

@@ -100,7 +100,7 @@ def test_tracks_are_given_as_a_lens_at_rest_shows_them() -> None:
     rays = profile.intrinsics.rays(np.array([[30.0, 110.0], [160.0, 40.0]]))
     seen = motion.optics.lens.project(rays)
     for _ in range(30):
-        seen = motion.optics.project(rays, motion.row_start_s(seen) + 0.5 * motion.exposure_s)
+        seen = motion.optics.project(rays, motion.row_time_s(seen, 0.0) + 0.5 * motion.exposure_s)
     lens = moving_lens(turning.trajectory, profile)
     resting = resting_points(lens, profile, Frame(0, 10**9, 0.1, 0.012), seen)
     np.testing.assert_allclose(resting, [[30, 110], [160, 40]], atol=1e-6)

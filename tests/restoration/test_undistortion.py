@@ -7,13 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from laws import FISHEYE, RADTAN, TurningCamera, phone
+from laws import FISHEYE, RADTAN, TurningCamera, phone, recorded_points
 from numpy.typing import NDArray
 
 from virest.camera.intrinsics import Intrinsics
 from virest.errors import SettingsError
 from virest.image_formation.row_motion import RowMotion
-from virest.image_formation.warp import corner_points, recorded_points, straightened_points
+from virest.image_formation.warp import corner_points, straightened_points
 from virest.restoration.shutter import perspective_map, rowwise_map
 from virest.restoration.undistortion import require_undistortable, undistortion_map
 

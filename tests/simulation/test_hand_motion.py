@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from steady_hand import constant_motion
 
-from virest.simulation.hand_motion import constant_motion, random_hand_motion
+from virest.simulation.hand_motion import random_hand_motion
 
 GRAVITY = np.array([0.0, 9.81, 0.0])
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from steady_hand import constant_motion
 
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import Extensions
@@ -17,7 +18,6 @@ from virest.simulation.exposure import (
     pixel_rays,
     start_fractions,
 )
-from virest.simulation.hand_motion import constant_motion
 from virest.simulation.scenes import Scene
 from virest.simulation.session import nominal_camera
 

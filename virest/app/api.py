@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.app.api_records import CalibrationFacts, DiagnosisFacts, SimulationFacts, SimulationOptions
+from virest.arrays import Picture
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame, read_capture, resolve_profile
@@ -33,7 +34,6 @@ from virest.restoration.frame import RestoredFrame, restore_frame
 from virest.restoration.one_kernel import as_colour, deblur_along, even_path, path_of_kernel
 from virest.restoration.settings import PRESETS, RestorationSettings
 
-Picture = NDArray[np.uint8]
 PathLike = str | os.PathLike[str]
 
 

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.diagnosis_text import describe
 from virest.app.field_record import field_record
 from virest.app.outputs import capture_name, json_text, output_error, plain, write_whole
 from virest.app.recreate import restored_scene
 from virest.app.run_folder import DIAGNOSIS, EXTENDED, FIGURE, FIGURES
+from virest.arrays import Picture
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import format_profile, profile_mapping
 from virest.camera.yaml_mapping import commented
@@ -46,7 +46,6 @@ from virest.simulation.session import SessionSettings, render_picture
 log = logging.getLogger(__name__)
 
 Json = dict[str, Any]
-Picture = NDArray[np.uint8]
 Progress = Callable[[str, float], None]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.outputs import output_error, write_picture
+from virest.arrays import Picture
 from virest.evaluation.fidelity import difference_map
 
-Picture = NDArray[np.uint8]
 MAP_GAIN = 2
 """Gain of the difference maps: most differences are below 30 grey levels, too dark to see."""
 HEAD_PX, GAP_PX = 22, 4

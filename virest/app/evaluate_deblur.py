@@ -12,12 +12,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.console import numeric_table
 from virest.app.difference_sheets import amplified_difference, labelled, write_sheet
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, read_picture, temporary_folder
 from virest.app.simulate import simulate_command
+from virest.arrays import Array, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.pixels import luma_of
 from virest.errors import CaptureError
@@ -36,7 +36,6 @@ from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import moving_lens
 from virest.restoration.settings import PRESETS, RestorationSettings
 
-Picture = NDArray[np.uint8]
 Progress = Callable[[str, float], Any]
 BLURRED = "blurred"
 CASE = "B: motion blur"
@@ -158,7 +157,7 @@ def _all_methods(capture: TrueCapture) -> Iterator[ComparedFrame]:
     """Each frame by the presets and by the baselines."""
     plan = capture.plan(RestorationSettings(deblur="none"))
     plans = {BLURRED: plan} | {f"virest {name}": replace(plan, settings=preset) for name, preset in PRESETS.items()}
-    curve = plan.profile.response or ResponseCurve("srgb")
+    curve = plan.profile.curve
     motions = capture.motions(plan)
     streams = zip(capture.recorded(), *(capture.restored(p) for p in plans.values()), strict=True)
     for (frame, recorded), *restored in streams:
@@ -293,7 +292,7 @@ def _size(picture: Picture) -> str:
     return f"{picture.shape[1]}x{picture.shape[0]}"
 
 
-def _aligned(picture: Picture, truth: Picture) -> tuple[Picture, NDArray[np.float64], tuple[int, int, int, int]]:
+def _aligned(picture: Picture, truth: Picture) -> tuple[Picture, Array, tuple[int, int, int, int]]:
     """The picture aligned to its reference, its shift in pixels, and the rectangle that both cover.
 
     Whole pixels by phase correlation, the rest by least squares; cubic interpolation, none for shifts below 0.02 px.
@@ -309,7 +308,7 @@ def _aligned(picture: Picture, truth: Picture) -> tuple[Picture, NDArray[np.floa
     return _moved(picture, shift), shift, (int(left), int(top), width - int(right), height - int(bottom))
 
 
-def _whole_shift(picture: Picture, truth: Picture) -> NDArray[np.float64]:
+def _whole_shift(picture: Picture, truth: Picture) -> Array:
     """Shift (x, y) of the picture against its reference in whole pixels; 0 if aligning does not reduce the error."""
     grey = [luma_of(p).astype(np.float32) for p in (truth, picture)]
     window = cv2.createHanningWindow(grey[0].shape[::-1], cv2.CV_32F)
@@ -323,7 +322,7 @@ def _whole_shift(picture: Picture, truth: Picture) -> NDArray[np.float64]:
     return shift if after < before else np.zeros(2)
 
 
-def _moved(picture: Picture, shift: NDArray[np.float64]) -> Picture:
+def _moved(picture: Picture, shift: Array) -> Picture:
     back = np.array([[1, 0, shift[0]], [0, 1, shift[1]]])
     size = picture.shape[1], picture.shape[0]
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP

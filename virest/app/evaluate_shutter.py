@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.console import cell, numeric_table
 from virest.app.difference_sheets import amplified_difference, labelled, write_sheet
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, temporary_folder
+from virest.arrays import Array, Mask, Picture
 from virest.capture.pixels import luma_of
 from virest.capture.video import read_decodable_gray
 from virest.errors import CaptureError
@@ -28,8 +28,6 @@ from virest.restoration.settings import RestorationSettings
 from virest.restoration.shutter import warp
 from virest.simulation.recording import RecordingOptions, write_recording
 
-Picture = NDArray[np.uint8]
-Array = NDArray[np.float64]
 Progress = Callable[[str, float], Any]
 METHODS: dict[str, str] = {
     "none": "as recorded",
@@ -224,7 +222,7 @@ def _outer_deg(lattice: Array, rectangle: Rectangle) -> Array:
     return np.degrees(quadrilateral_angles_rad(rectangle.corners(lattice)))
 
 
-def _neighbour_errors_deg(lattice: Array, truth: Array, everywhere: NDArray[np.bool_]) -> Array:
+def _neighbour_errors_deg(lattice: Array, truth: Array, everywhere: Mask) -> Array:
     """Differences (n,) over the corners that all methods have."""
     shown, true = (np.where(everywhere[..., None], points, np.nan) for points in (lattice, truth))
     errors = np.degrees(neighbour_angles_rad(shown) - neighbour_angles_rad(true))

@@ -37,7 +37,7 @@ from virest.app.slam_sequences import (
     write_sequences,
 )
 from virest.errors import OutputError, SettingsError, VirestError
-from virest.evaluation.structure_from_motion import SfmSettings, require_pycolmap
+from virest.evaluation.structure_from_motion import MAX_FEATURES, OVERLAP, THREADS, require_pycolmap
 from virest.evaluation.trajectories import ScoreSummary, TrajectoryScore, added_error_removed, score_path, summarise
 from virest.restoration.settings import PRESETS
 
@@ -95,7 +95,9 @@ def run_slam(
             if progress:
                 progress(task.name, k / len(tasks))
             rows.append(_judged(task, out, words, options))
-        facts = {**tools, "preset": options.preset, "sfm": _sfm_facts(options), "results": rows}
+        colmap = {"features": MAX_FEATURES, "overlap": OVERLAP, "threads": THREADS}
+        sfm = colmap if options.command is None else None
+        facts = {**tools, "preset": options.preset, "sfm": sfm, "results": rows}
         facts["summary"] = _summary(rows)
         if options.out:
             (out / "results.json").write_text(json_line(facts) + "\n", encoding="utf-8")
@@ -129,7 +131,7 @@ def _scored(sequences: SlamSequences, seeds: int, words: list[str] | None, optio
     kinds: dict[str, Any] = {}
     for kind in sequences.kinds:
         if words is None:
-            runs = list(track_with_colmap(sequences, kind, numbers, SfmSettings()))
+            runs = list(track_with_colmap(sequences, kind, numbers))
         else:
             runs = list(track_with_command(sequences, kind, numbers, words, options.timeout_s))
         reference, scores = _best_reference(sequences, kind, runs)
@@ -249,13 +251,6 @@ def _tools(command: str | None) -> dict[str, Any]:
         return {"versions": used, "tracker": command}
     require_pycolmap()
     return {"versions": used | {"pycolmap": installed_version("pycolmap")}, "tracker": "pycolmap"}
-
-
-def _sfm_facts(options: SlamOptions) -> dict[str, Any] | None:
-    settings = SfmSettings()
-    if options.command is not None:
-        return None
-    return {"features": settings.max_features, "overlap": settings.overlap, "threads": settings.threads}
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

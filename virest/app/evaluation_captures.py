@@ -11,11 +11,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app.machine import installed_version
 from virest.app.planning import estimate_plan
+from virest.arrays import Picture
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
 from virest.capture.video import MovieIndex, probe_movie, read_frames
@@ -27,8 +27,6 @@ from virest.restoration.capture import RestorationPlan, at_true_times, restore_f
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import RestorationSettings
 from virest.simulation.recording import truth_picture
-
-Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ from virest.app.export_plan import (
 )
 from virest.app.export_scenes import colmap_files, frame_poses, gyroflow_profile, transforms_json
 from virest.app.outputs import json_text, output_error, write_picture
+from virest.arrays import Array
 from virest.camera.kalibr import ImuNoise, format_camchain, format_imu
 from virest.camera.orb_slam import format_orb_slam
 from virest.camera.profile_file import format_profile
@@ -231,7 +232,7 @@ def _rate_hz(times_ns: list[int]) -> float:
     return round(1.0 / period_s, 3) if period_s else 1.0
 
 
-def _without_holes(time_s: NDArray[np.float64], accel: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_holes(time_s: Array, accel: Array) -> Array:
     """Accelerations with missing rows interpolated linearly; all NaN without an accelerometer."""
     known = np.isfinite(accel).all(axis=1)
     if known.all() or not known.any():
@@ -245,7 +246,7 @@ def _tum_imu(rows: str) -> str:
     return "# timestamp[ns] w.x w.y w.z a.x a.y a.z\n" + body
 
 
-def _tum_accelerometer(time_ns: NDArray[np.int64], accel: NDArray[np.float64]) -> str:
+def _tum_accelerometer(time_ns: NDArray[np.int64], accel: Array) -> str:
     head = "# accelerometer data\n# timestamp ax ay az\n"
     rows = zip(time_ns.tolist(), accel.tolist(), strict=True)
     return head + "".join(f"{seconds(time)} {' '.join(map(repr, row))}\n" for time, row in rows)

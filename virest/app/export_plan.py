@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from virest.app.outputs import capture_name
 from virest.app.run_folder import RunFolder, read_lines
+from virest.arrays import Array
 from virest.camera.kalibr import ImuNoise, field_notes, measure_imu_noise
 from virest.camera.lens_fit import standard_lens
 from virest.camera.profile import CameraProfile
@@ -105,7 +106,7 @@ class ExportPlan:
     """Whether restored frames show the start of the first row's exposure."""
     standard: CameraProfile
     """The profile in a form that other tools support: the closest standard lens model, no fields."""
-    gyro_rad_s: NDArray[np.float64]
+    gyro_rad_s: Array
     """(n, 3) gyroscope readings including the profile's rate fields."""
     poses: GivenPoses | None = None
 
@@ -248,7 +249,7 @@ def _choose(
     return [frame for frame in chosen if frame.skip_reason is None]
 
 
-def _instants_s(frames: list[Frame], profile: CameraProfile, reference: str) -> NDArray[np.float64]:
+def _instants_s(frames: list[Frame], profile: CameraProfile, reference: str) -> Array:
     """(n,) seconds from each timestamp to the instant that its frame shows.
 
     reference: ``exposure-start`` of the first row, else the middle: half the readout and half the exposure later.
@@ -264,7 +265,7 @@ def _instants_s(frames: list[Frame], profile: CameraProfile, reference: str) -> 
 def _stamped(
     chosen: list[Frame],
     capture: Capture,
-    instants_s: NDArray[np.float64],
+    instants_s: Array,
     options: ExportOptions,
     pictures: dict[int, Path] | None,
     left_out: dict[str, int],
@@ -283,9 +284,7 @@ def _stamped(
     return tuple(found)
 
 
-def _written_profile(
-    profile: CameraProfile, instants_s: NDArray[np.float64], options: ExportOptions
-) -> tuple[CameraProfile, float]:
+def _written_profile(profile: CameraProfile, instants_s: Array, options: ExportOptions) -> tuple[CameraProfile, float]:
     """The profile of the written data, and the seconds from a written timestamp to the instant of its frame.
 
     Samples are on the camera's clock, so offset, skew and delay over time vanish, as do rate fields, which the samples
@@ -337,7 +336,7 @@ def _for_frames(
     return replace(profile, extensions=extensions)
 
 
-def _corrected_gyro(capture: Capture, profile: CameraProfile) -> NDArray[np.float64]:
+def _corrected_gyro(capture: Capture, profile: CameraProfile) -> Array:
     """Gyroscope readings (n, 3) corrected for all errors but bias, scale and noise."""
     missing = missing_rate_rad_s(capture.imu, profile)
     if missing is None:
@@ -351,9 +350,7 @@ def _imu_time_ns(capture: Capture, profile: CameraProfile) -> NDArray[np.int64]:
     return np.asarray(capture.stamp_0_ns + np.rint(camera_s * 1e9).astype(np.int64), np.int64)
 
 
-def _notes(
-    capture: Capture, profile: CameraProfile, options: ExportOptions, instants_s: NDArray[np.float64]
-) -> list[ExportNote]:
+def _notes(capture: Capture, profile: CameraProfile, options: ExportOptions, instants_s: Array) -> list[ExportNote]:
     notes = []
     if profile.time_offset_s is None:
         notes.append(

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from virest.app.export_plan import ExportFrame, ExportPlan
 from virest.app.outputs import json_text
+from virest.arrays import Array
 from virest.camera.colmap import HALF_PX, colmap_camera
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
@@ -28,7 +28,6 @@ from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Json = dict[str, Any]
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """Rotation between OpenGL's camera axes and ours, in both directions."""

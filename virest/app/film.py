@@ -13,14 +13,13 @@ from typing import Any
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.outputs import output_error
+from virest.arrays import Picture
 from virest.capture.join import TICKS_PER_S
 from virest.capture.pixels import BT601
 from virest.errors import OutputError
 
-Picture = NDArray[np.uint8]
 QUALITY = "17"
 """x264's constant rate factor: hardly distinguishable from the PNGs."""
 UPRIGHT = (1, 0, 0, 1)

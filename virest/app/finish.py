@@ -10,11 +10,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.film import display_matrix, side_by_side, write_film
 from virest.app.outputs import require_file, write_picture
 from virest.app.run_folder import RunFolder, parse_lines
+from virest.arrays import Picture
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.location import is_remote, read_each
@@ -25,7 +25,6 @@ from virest.restoration.shutter import warp
 from virest.restoration.undistortion import undistortion_map
 
 Json = dict[str, Any]
-Picture = NDArray[np.uint8]
 Crop = tuple[int, int, int, int]
 LEAST_CROP_PX = 16
 """The smallest frame that a camera profile accepts."""

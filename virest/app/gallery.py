@@ -18,10 +18,10 @@ from virest.app.diagnose import draw_figures, open_source
 from virest.app.outputs import write_whole
 from virest.app.pictures import compact
 from virest.app.simulate import simulate_command
-from virest.diagnosis.catalogue import CATALOGUE
 from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 from virest.diagnosis.geometric_evidence import CAP
 from virest.diagnosis.ladder import diagnose_capture
+from virest.effects.table import EFFECTS
 
 FRAMES, WIDTH, HEIGHT, SEED = 60, 640, 480, 11
 """Two seconds of the simulator's usual landscape frame; any seed."""
@@ -133,7 +133,7 @@ def _draw_case(name: str, folder: Path, images: Path) -> dict[str, Any]:
     source = open_source(folder)
     found = diagnose_capture(source.capture, source.profile, source.pictures, source.gray)
     files, _ = draw_figures(source.capture, found)
-    wanted = "residuals" if CATALOGUE[name].seen_in == GEOMETRY else f"_{name}"
+    wanted = "residuals" if EFFECTS[name].seen_in == GEOMETRY else f"_{name}"
     figure = next((data for path, data in files.items() if path.endswith(f"{wanted}.png")), None)
     if figure is not None:
         write_whole(images / f"{name}.png", compact(figure))
@@ -153,7 +153,7 @@ def _draw_case(name: str, folder: Path, images: Path) -> dict[str, Any]:
 
 def _section(name: str, found: dict[str, Any]) -> str:
     case = CASES[name]
-    evidence = EVIDENCE[CATALOGUE[name].seen_in]
+    evidence = EVIDENCE[EFFECTS[name].seen_in]
     lines = [f"## {name}", "", f"Hidden: `--effect {name}={case.value}`. Shows in {evidence}:"]
     lines += [f"{case.look_for}.", "", f"Verdict: **{found['verdict']}**", ""]
     for cause in found["causes"]:

@@ -11,16 +11,17 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app import api
 from virest.app.console import emit
 from virest.app.evaluation_captures import truth_frame
 from virest.app.outputs import write_whole
 from virest.app.simulate import simulate_command
+from virest.arrays import Picture
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture
 from virest.image_formation.blur import tile_grid
@@ -30,10 +31,17 @@ from virest.image_formation.row_motion import row_motion
 from virest.motion.integration import integrate_gyro
 from virest.report.concepts import axes_figure, blur_figure, rows_figure, strip_figure
 
-Picture = NDArray[np.uint8]
 COLOURS = 192
 """Colours of a palette picture, a third of the size; photographs keep full colour."""
 PHOTOGRAPHS = ("before_after", "joint", "blur_paths")
+CONTENTS: dict[str, dict[str, Any]] = {
+    "photographs": {"frames": 8, "exposure_ms": 12.0, "readout_ms": 25.0, "rate_rad_s": 1.3, "noise_levels": 1.2,
+                    "seed": 52},
+    "board": {"frames": 8, "exposure_ms": 5.0, "readout_ms": 30.0, "rate_rad_s": 2.2, "bitrate_bits_per_px": 1.0,
+              "seed": 41},
+    "text": {"frames": 9, "exposure_ms": 18.0, "readout_ms": 25.0, "rate_rad_s": 1.2, "noise_levels": 2.0, "seed": 55},
+}  # fmt: skip
+"""What `simulate` films, by scene."""
 ARROW_STEP_PX = 80
 """144 arrows in a frame of 1280 × 720."""
 
@@ -56,7 +64,7 @@ def write_pictures(folder: Path) -> None:
     """Write all pictures below ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as work:
-        photographs, board, page = _photographs(Path(work)), _board(Path(work)), _page(Path(work))
+        photographs, board, page = (_shot(Path(work), scene) for scene in CONTENTS)
         files = {
             "before_after": _before_after(photographs),
             "joint": _joint(page),
@@ -82,31 +90,9 @@ def compact(png: bytes) -> bytes:
     return out.getvalue()
 
 
-def _photographs(work: Path) -> _Shot:
-    simulate_command(
-        work / "photographs", scene="photographs", width=960, height=720, frames=8, exposure_ms=12.0, readout_ms=25.0,
-        rate_rad_s=1.3, noise_levels=1.2, seed=52,
-    )  # fmt: skip
-    return _shot(work / "photographs", 4)
-
-
-def _board(work: Path) -> _Shot:
-    simulate_command(
-        work / "board", scene="board", width=960, height=720, frames=8, exposure_ms=5.0, readout_ms=30.0,
-        rate_rad_s=2.2, bitrate_bits_per_px=1.0, seed=41,
-    )  # fmt: skip
-    return _shot(work / "board", 4)
-
-
-def _page(work: Path) -> _Shot:
-    simulate_command(
-        work / "page", scene="text", width=960, height=720, frames=9, exposure_ms=18.0, readout_ms=25.0,
-        rate_rad_s=1.2, noise_levels=2.0, seed=55,
-    )  # fmt: skip
-    return _shot(work / "page", 4)
-
-
-def _shot(folder: Path, frame: int) -> _Shot:
+def _shot(work: Path, scene: str) -> _Shot:
+    folder, frame = work / scene, 4
+    simulate_command(folder, scene=scene, width=960, height=720, **CONTENTS[scene])
     capture = api.open(folder)
     restored, single = (capture.restore(frame, "best", **alone).picture for alone in ({}, {"neighbours": 0}))
     if restored is None or single is None:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app import api
 from virest.app.outputs import require_file, write_whole
+from virest.arrays import Array
 from virest.capture.folder import Frame
 from virest.errors import CaptureError
 from virest.image_formation.row_clock import RowClock
@@ -70,7 +70,7 @@ def _turned_rad(capture: api.Capture, frame: Frame) -> float:
     middle_s = RowClock(profile).middle_s(frame.time_s, frame.exposure_s or 0.0)
     imu = capture.imu
     rate = np.array([np.interp(middle_s, imu.time_s, imu.gyro_rad_s[:, axis]) for axis in range(3)])
-    turning: NDArray[np.float64] = profile.rotation_cam_imu @ (rate - np.array(profile.gyro_bias_rad_s))
+    turning: Array = profile.rotation_cam_imu @ (rate - np.array(profile.gyro_bias_rad_s))
     return float(np.hypot(turning[0], turning[1])) * (exposure_s or readout_s or 1.0)
 
 

@@ -17,7 +17,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from virest import __version__
 from virest.app.account import STATUSES
@@ -33,6 +32,7 @@ from virest.app.report_files import (
     read_tiles,
 )
 from virest.app.run_folder import DIAGNOSIS, EXTENDED, FIGURE, FIGURES, REPORT, RunFolder
+from virest.arrays import Picture
 from virest.capture.pictures import MOVIE_SUFFIXES
 from virest.capture.video import MovieIndex, probe_movie, read_frames
 from virest.errors import PARTLY_FAILED, CaptureError, VirestError
@@ -62,7 +62,6 @@ MAX_PROFILE_BYTES, MAX_PICTURE_BYTES = 1 << 20, 256 << 20
 ONLY_AFTER = "recorded frames are not shown"
 
 Json = dict[str, Any]
-Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from virest.app.frame_log import frame_line
 from virest.app.outputs import json_line, write_picture, write_whole
 from virest.app.run_folder import RunFolder
 from virest.app.worker_processes import prepare_worker
+from virest.arrays import Picture
 from virest.capture.folder import Capture, Frame
 from virest.capture.imu import ImuSamples
 from virest.capture.location import is_unreachable
@@ -32,7 +33,6 @@ from virest.restoration.capture import RestorationPlan, at_true_times, restore_f
 from virest.restoration.frame import RestoredFrame
 
 log = logging.getLogger(__name__)
-Picture = NDArray[np.uint8]
 
 MIN_SEGMENT_FRAMES, USUAL_SEGMENT_FRAMES, MAX_SEGMENT_FRAMES = 5, 10, 30
 """Few enough to spread over the processes, with enough frames to pay for decoding from the key frame on."""

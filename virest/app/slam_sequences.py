@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from virest.app.jobs import Workers
 from virest.app.process import ProcessOptions, process_capture
 from virest.app.run_folder import read_lines
+from virest.arrays import Array
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.orb_slam import format_orb_slam
 from virest.camera.profile import CameraProfile
@@ -32,14 +33,12 @@ from virest.capture.pixels import luma_of
 from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_frames
 from virest.errors import CaptureError, SettingsError
-from virest.evaluation.structure_from_motion import SfmSettings, find_path, match_pictures
+from virest.evaluation.structure_from_motion import find_path, match_pictures
 from virest.evaluation.trajectories import CameraPath, match_times, parse_tum, tum_text
 from virest.image_formation.row_motion import frame_times_s
 from virest.restoration.capture import at_true_times
 from virest.restoration.settings import RestorationSettings
 from virest.simulation.recording import truth_picture
-
-Array = NDArray[np.float64]
 
 KINDS = ("global", "rolling", "restored")
 PLACEHOLDERS = ("sequence", "trajectory", "settings", "times", "seed")
@@ -189,17 +188,15 @@ def orb_slam_settings(profile: CameraProfile, fps: float) -> str:
 # ── tracking them ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def track_with_colmap(
-    sequences: SlamSequences, kind: str, seeds: list[int], settings: SfmSettings
-) -> Iterator[dict[int, Array]]:
+def track_with_colmap(sequences: SlamSequences, kind: str, seeds: list[int]) -> Iterator[dict[int, Array]]:
     """Positions by frame (0 … frames − 1) from structure from motion, for each seed."""
     work = sequences.folder / f"{kind}-colmap"
     work.mkdir()
     try:
-        database = match_pictures(sequences.pictures(kind), work, sequences.lens, settings)
+        database = match_pictures(sequences.pictures(kind), work, sequences.lens)
         place = {f"{stamp}.png": k for k, stamp in enumerate(sequences.stamps_ns)}
         for seed in seeds:
-            found = find_path(database, work, seed, settings)
+            found = find_path(database, work, seed)
             frames = [place[name] for name in found.pictures]
             stamps_s = _seconds(sequences)[frames]
             text = tum_text(CameraPath(stamps_s, found.position, found.q_world_cam))

@@ -10,18 +10,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 
+from virest.arrays import Array
 from virest.calibration.exposure_check import FirstCurve
 from virest.camera.response import ResponseCurve
 
-Array = NDArray[np.float64]
 TABLE_KNOTS = 14
-TABLE_LEVELS = 96
+"""Knots of a table.  With 7, the table of a dark bracket is off by 1.0 grey levels instead of 0.7; with 28 by 0.8, and
+standard deviations grow 1.3 to 3 times."""
+TABLE_LEVELS, FIT_LEVELS = 96, 384
+"""Entries of a table, and of a curve while it is fitted; twice as many change three simulated fits by 0.01 levels."""
 SMALLEST_LIGHT = 1e-7
-FIT_LEVELS = 384
+"""Keeps logarithms finite: below any grey of 8 bits."""
 FULL_LEVEL = 253.8
 """A brightest grey above this is the end of the 8-bit range, not the curve's plateau."""
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from virest.arrays import Array, Mask
 from virest.calibration.bracket_samples import BracketSamples
 from virest.calibration.curve_certainty import CurvePosterior, curve_posterior, derivatives, inner_steps
 from virest.calibration.curve_families import Family, LogLookup, log_lookup, make_family
@@ -17,19 +18,20 @@ from virest.camera.response import KINDS, ResponseCurve
 from virest.errors import CalibrationError
 from virest.inference.robust import robust_std
 
-Array = NDArray[np.float64]
 TRUSTED_EV = 0.02
 """Prior standard deviation of a trusted listed exposure."""
 FREE_EV = 4.0
 """Prior standard deviation of a suspect listed exposure."""
 OUTLIER_LEVELS = 20.0
+"""Residuals are capped at this, grey levels, before kinds are compared; half or twice it changed no simulated fit."""
 WIDEST_EV = 20.0
 """Bound on exposure corrections; a camera's shutter range is smaller."""
 SMOOTH_WEIGHT = 5.0
 """Weight of a table's roughness in the fit, which treats sample errors as independent."""
 SCORE_CAP = 16.0
 """Maximum squared normalised residual of one grey in a score."""
-Z_REJECTED = 3.0
+SIGNIFICANT_Z = 3.0
+"""Standard deviations above which a difference is none by chance (1 in 370)."""
 DISTINCT_LEVELS = 0.25
 """Systematic differences between two kinds below this are attributed to rounding and compression."""
 STRUCTURE_LEVELS = 0.3
@@ -104,7 +106,7 @@ class Trial:
     curve: ResponseCurve
     parameters: Array
     correction_ev: Array
-    suspect: NDArray[np.bool_]
+    suspect: Mask
     score: Array
     """(held-out samples,) sum of capped squared normalised residuals."""
     site: NDArray[np.int64]
@@ -118,7 +120,7 @@ class Trial:
         trusted = self.correction_ev[~self.suspect]
         trend = float(self.trend_row[~self.suspect] @ trusted) ** 2
         scatter = max(float(trusted @ trusted) - trend, 0.0) / max(len(trusted) - 2, 1)
-        return trend > Z_REJECTED**2 * max(scatter, TRUSTED_EV**2)
+        return trend > SIGNIFICANT_Z**2 * max(scatter, TRUSTED_EV**2)
 
 
 def require_possible(first: FirstCurve, samples: BracketSamples) -> None:
@@ -136,7 +138,7 @@ def require_possible(first: FirstCurve, samples: BracketSamples) -> None:
         )
 
 
-def optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDArray[np.bool_],
+def optimise(family: Family, start: Array, samples: BracketSamples, suspect: Mask,
               evaluations: int = 30) -> tuple[Array, Array]:  # fmt: skip
     """Curve parameters and exposure corrections (EV) of least cost, with a soft-L1 loss on the residuals."""
     samples, shape = samples.by_light(), len(family.start)
@@ -167,7 +169,7 @@ def optimise(family: Family, start: Array, samples: BracketSamples, suspect: NDA
     return found.x[:shape], no_trend @ found.x[shape:]
 
 
-def _trend_rows(exposure: Array, suspect: NDArray[np.bool_]) -> Array:
+def _trend_rows(exposure: Array, suspect: Mask) -> Array:
     """Orthonormal rows (2, pictures): level and trend over log exposure of the corrections of trusted pictures.
 
     The level only sets the unit of light and is projected out.  So is the trend if the curve has a free exponent, since
@@ -203,7 +205,7 @@ def _from_best_start(family: Family, fit: BracketSamples, first: FirstCurve) -> 
 
 
 def scored_trial(
-    family: Family, parameters: Array, correction_ev: Array, suspect: NDArray[np.bool_], samples: BracketSamples
+    family: Family, parameters: Array, correction_ev: Array, suspect: Mask, samples: BracketSamples
 ) -> Trial:
     """Score a fitted curve on samples, usually held out."""
     curve = family.build(parameters)
@@ -245,10 +247,10 @@ def significantly_worse(one: Trial, other: Trial) -> bool:
     gain = np.bincount(index, one.score - other.score)
     if one.held_out_rms**2 - other.held_out_rms**2 < DISTINCT_LEVELS**2:
         return False
-    return bool(gain.mean() > Z_REJECTED * gain.std() / np.sqrt(len(gain)))
+    return bool(gain.mean() > SIGNIFICANT_Z * gain.std() / np.sqrt(len(gain)))
 
 
-def refit(trial: Trial, samples: BracketSamples, may_be_wrong: NDArray[np.bool_]) -> Trial:
+def refit(trial: Trial, samples: BracketSamples, may_be_wrong: Mask) -> Trial:
     """Fit again to all samples; pictures of ``may_be_wrong`` whose correction is now an outlier become suspect too."""
     start = np.concatenate([trial.parameters, trial.correction_ev])
     suspect = trial.suspect

@@ -20,26 +20,30 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.stats import chi2
 
+from virest.arrays import Array, Mask
 from virest.inference.robust import MEDIAN_TO_STD
 
-Array = NDArray[np.float64]
 DARKEST_JUDGED, BRIGHTEST_JUDGED = 4.0, 251.0
 """Range of greys in which a square's noise is mostly unclipped; beyond it, noise is clipped at 0 or 255."""
-BINS = 13
-MIN_SQUARES = 15
+BINS, MIN_SQUARES = 13, 15
+"""Greys of the noise table, and fewest squares from which one is filled.  6 or 26 greys change three simulated curves
+by 0.1 levels at most; 8 or 30 squares change none."""
 FLAT_SHARE = 0.1
 """Quantile of the variance that represents the flattest squares."""
 ROUNDING_LEVELS = 0.15
 """Lower limit on the standard deviation of a square's mean, since neighbouring pixels share rounding errors."""
-SMALLEST_VARIANCE, LARGEST_VARIANCE = 0.05, 400.0
+SMALLEST_VARIANCE = 0.05
+"""Of a pixel, levels²: rounding alone has 1 / 12, and an encoder may leave less."""
 MORE_LIGHT = 2**0.4
 """Minimum exposure ratio of two pictures to test whether a grey follows the light."""
 SAME_LEVELS = 0.75
+"""Greys that differ by less are the same."""
 PILE = 0.02
 """Minimum fraction of a channel's samples that must rest at a grey for it to be an end."""
 DIFFER_LEVELS = 1.5
 """A conversion from YCbCr rounds the three channels to ends that differ by up to this."""
 CUT_SIGMA = 3.0
+"""Greys this many standard deviations of noise from 0 or 255 are clipped in 1 of 740 pixels at most."""
 RELIABLE_SIGMA = 2.0
 """About 2.5 % of the reliable greys are moved beyond the limit by their noise."""
 WINDOW_SITES = 31
@@ -98,7 +102,7 @@ def pixel_noise(means: Array, variances: Array, pixels: int) -> GreyNoise:
     for c in rows.tolist():
         known = np.isfinite(table[c])
         filled[c] = np.interp(middles, middles[known], table[c, known])
-    return GreyNoise(middles, np.clip(filled, SMALLEST_VARIANCE, LARGEST_VARIANCE))
+    return GreyNoise(middles, np.maximum(filled, SMALLEST_VARIANCE))
 
 
 def mean_noise(noise: GreyNoise, pixels: int) -> GreyNoise:
@@ -106,7 +110,7 @@ def mean_noise(noise: GreyNoise, pixels: int) -> GreyNoise:
     return replace(noise, variance=noise.variance / pixels + ROUNDING_LEVELS**2)
 
 
-def scatter_by_grey(residual: Array, grey: Array, channel: NDArray[np.int64], used: NDArray[np.bool_]) -> Array:
+def scatter_by_grey(residual: Array, grey: Array, channel: NDArray[np.int64], used: Mask) -> Array:
     """Robust variance (channels, bins) of residuals by grey; NaN for bins with too few.
 
     residual, grey, used: (samples, pictures) levels.  Each sample's light was fitted to its n greys, which reduces the
@@ -126,7 +130,7 @@ def scatter_by_grey(residual: Array, grey: Array, channel: NDArray[np.int64], us
     return found
 
 
-def reliably_inside(grey: Array, light: Array, limits: tuple[Array, Array], sigma: Array) -> NDArray[np.bool_]:
+def reliably_inside(grey: Array, light: Array, limits: tuple[Array, Array], sigma: Array) -> Mask:
     """Greys (samples, pictures) that lie between their limits because of their light and not of their noise.
 
     grey, sigma: (samples, pictures) levels and their standard deviation.  light: (samples, pictures) brightness of each

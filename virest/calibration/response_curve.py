@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from virest.arrays import Array, Mask
 from virest.calibration.bracket_samples import MIN_SHARED, BracketPicture, BracketSamples, sample_bracket
 from virest.calibration.curve_certainty import CurvePosterior
 from virest.calibration.curve_families import LogLookup, log_lookup
 from virest.calibration.curve_trials import (
+    SIGNIFICANT_Z,
     STRUCTURE_LEVELS,
     Trial,
     choose_kind,
@@ -41,14 +43,12 @@ from virest.calibration.grey_levels import reliably_inside, scatter_by_grey
 from virest.camera.response import KINDS, ResponseCurve
 from virest.errors import CalibrationError, SettingsError
 
-Array = NDArray[np.float64]
-MIN_RATIO = 2**0.25
-FEW_RATIO = 2**1.5
-MOVED_LEVELS = 8.0
-MAX_MOVED = 0.2
+MIN_RATIO, FEW_RATIO = 2**0.25, 2**1.5
+"""Ratios of the largest to the smallest exposure: below 0.25 EV a bracket is refused, below 1.5 EV called weak."""
+MOVED_LEVELS, MAX_MOVED = 8.0, 0.2
+"""A sample that deviates by more, rms over the exposures, has moved; a scene is still if at most this part has."""
 WORST_OF_MEDIAN = 3.0
 """A sample is excluded if its largest residual exceeds this multiple of the median over samples."""
-ESTABLISHED_Z = 3.0
 SCATTER_EV = 0.06
 """Scatter of the listed exposures that is reported: three times their prior standard deviation."""
 OPEN_LEVELS = 2.0
@@ -177,12 +177,12 @@ class _Verdict:
         return float(np.hypot(self.posterior.rms_levels, self.misfit_levels))
 
     @property
-    def established(self) -> NDArray[np.bool_]:
+    def established(self) -> Mask:
         """(pictures,): whether an exposure error is significant given the posterior uncertainty of the table."""
-        return np.abs(self.final.correction_ev) > ESTABLISHED_Z * self.posterior.exposure_std_ev
+        return np.abs(self.final.correction_ev) > SIGNIFICANT_Z * self.posterior.exposure_std_ev
 
 
-def _choose_curve(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wrong: NDArray[np.bool_]) -> _Verdict:
+def _choose_curve(kind: str, samples: BracketSamples, first: FirstCurve, may_be_wrong: Mask) -> _Verdict:
     """Fit the kinds on even sites, choose one on odd sites, refit it to all, and assess its uncertainty."""
     odd = samples.site % 2 == 1
     trials = fit_kinds(kind, samples.take(~odd), samples.take(odd), first)
@@ -218,8 +218,8 @@ def _require_bracket(pictures: Sequence[BracketPicture]) -> None:
 
 
 def _keep_connected(
-    pictures: Sequence[BracketPicture], kept: NDArray[np.bool_], samples: BracketSamples
-) -> tuple[NDArray[np.bool_], BracketSamples]:
+    pictures: Sequence[BracketPicture], kept: Mask, samples: BracketSamples
+) -> tuple[Mask, BracketSamples]:
     """Drop pictures that are clipped throughout: mask over all pictures, and the samples of those kept."""
     seen = _connected([p for p, k in zip(pictures, kept, strict=True) if k], samples)
     kept = kept.copy()
@@ -228,7 +228,7 @@ def _keep_connected(
     return kept, samples.take(samples.measured.sum(axis=1) >= 2)
 
 
-def _connected(pictures: Sequence[BracketPicture], samples: BracketSamples) -> NDArray[np.bool_]:
+def _connected(pictures: Sequence[BracketPicture], samples: BracketSamples) -> Mask:
     """Mask of pictures not clipped throughout.  Raises CalibrationError if these do not overlap in one chain."""
     measured = samples.measured.astype(np.int64)
     shared = measured.T @ measured
@@ -261,7 +261,7 @@ def _require_determined(verdict: _Verdict) -> None:
         raise CalibrationError(text, hint="take more exposures, closer together, of a scene with many brightnesses")
 
 
-def _still_rows(samples: BracketSamples, first: FirstCurve) -> NDArray[np.bool_]:
+def _still_rows(samples: BracketSamples, first: FirstCurve) -> Mask:
     """Mask of samples explained by one light at every exposure.  Raises CalibrationError if too many are not.
 
     A moving scene is wrong at most exposures; a codec error at one exposure affects all sites.  So a scene is refused
@@ -365,11 +365,7 @@ def _criticise(verdict: _Verdict, samples: BracketSamples) -> list[str]:
 
 
 def _result(
-    pictures: Sequence[BracketPicture],
-    seen: NDArray[np.bool_],
-    verdict: _Verdict,
-    samples: BracketSamples,
-    notes: list[str],
+    pictures: Sequence[BracketPicture], seen: Mask, verdict: _Verdict, samples: BracketSamples, notes: list[str]
 ) -> CurveFit:
     final = verdict.final
     log_t = np.log(samples.exposure) + LN2 * final.correction_ev
@@ -399,7 +395,7 @@ def _result(
     )
 
 
-def _picture_fits(pictures: Sequence[BracketPicture], seen: NDArray[np.bool_], final: Trial) -> tuple[PictureFit, ...]:
+def _picture_fits(pictures: Sequence[BracketPicture], seen: Mask, final: Trial) -> tuple[PictureFit, ...]:
     trusted = final.correction_ev[~final.suspect]
     error = np.full(len(pictures), np.nan)
     error[seen] = (np.median(trusted) if len(trusted) else 0.0) - final.correction_ev

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.capture.imu import ImuSamples
 from virest.effects.table import EFFECTS
 from virest.image_formation.point_model import TrackTable
@@ -37,9 +37,9 @@ class HeldValue:
 
     name: str
     """Key of OPTIONAL."""
-    change: NDArray[np.float64]
+    change: Array
     """(k,) change from the fixed value, in the term's units."""
-    std: NDArray[np.float64]
+    std: Array
     """(k,) standard deviation, including tracking bias."""
 
     @property

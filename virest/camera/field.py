@@ -21,12 +21,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 
+from virest.arrays import Array
 from virest.errors import SettingsError
 
-Array = NDArray[np.float64]
 AXES = ("x", "y", "z")
 RATES, FORCES = tuple(f"rate_{a}" for a in AXES), tuple(f"accel_{a}" for a in AXES)
 KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {

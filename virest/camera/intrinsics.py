@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import Field
 from virest.errors import SettingsError
 
@@ -60,7 +60,7 @@ class Intrinsics:
             )
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Array:
         """K of the paper, (3, 3)."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
@@ -79,7 +79,7 @@ class Intrinsics:
         """The camera of the same focal lengths and principal point without distortion."""
         return replace(self, model="none", coefficients=(), displaced=None)
 
-    def radius_px(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def radius_px(self, points_px: Array) -> Array:
         """Distance (...) of pixels (..., 2) from the principal point."""
         return np.hypot(points_px[..., 0] - self.cx_px, points_px[..., 1] - self.cy_px)
 
@@ -87,13 +87,13 @@ class Intrinsics:
         """The same lens with both focal lengths multiplied by ``scale``."""
         return replace(self, fx_px=self.fx_px * scale, fy_px=self.fy_px * scale)
 
-    def project(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    def project(self, rays: Array) -> Array:
         """Pixels (..., 2) of rays (..., 3) in camera axes; z > 0 is in front of the camera."""
         plane = rays[..., :2] / rays[..., 2:]
         points = self._distort(plane) * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
         return points if self.displaced is None else points + self.displaced.at(points[..., 0], points[..., 1])
 
-    def rays(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rays(self, points_px: Array) -> Array:
         """Rays (..., 3) with z = 1 through pixels (..., 2): the inverse of :meth:`project`."""
         if self.displaced is not None:
             points_px = self.displaced.undisplaced(points_px)
@@ -101,7 +101,7 @@ class Intrinsics:
         plane = self._undistort(distorted)
         return np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1)
 
-    def _distort(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _distort(self, plane: Array) -> Array:
         if self.model != "fisheye" and not any(self.coefficients):
             return plane
         if self.model == "fisheye":
@@ -118,7 +118,7 @@ class Intrinsics:
             axis=-1,
         )
 
-    def _undistort(self, distorted: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _undistort(self, distorted: Array) -> Array:
         """Newton's method on the distortion.
 
         Beyond the radius at which radial distortion folds back, no ray is seen: pixels there get the rays just inside,
@@ -147,7 +147,7 @@ class Intrinsics:
                 break
         return plane
 
-    def _distortion_jacobian(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _distortion_jacobian(self, plane: Array) -> Array:
         k1, k2, p1, p2, k3 = self.coefficients
         x, y = plane[..., 0], plane[..., 1]
         r2 = x * x + y * y
@@ -175,17 +175,17 @@ def _fold_radius(coefficients: tuple[float, ...]) -> float:
     return float(np.sqrt(r2) * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))))
 
 
-def _fisheye_angle(theta: NDArray[np.float64], k: tuple[float, ...]) -> NDArray[np.float64]:
+def _fisheye_angle(theta: Array, k: tuple[float, ...]) -> Array:
     t2 = theta * theta
     return theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
 
 
-def _fisheye_slope(theta: NDArray[np.float64], k: tuple[float, ...]) -> NDArray[np.float64]:
+def _fisheye_slope(theta: Array, k: tuple[float, ...]) -> Array:
     t2 = theta * theta
     return 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
 
 
-def _solve_2x2(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+def _solve_2x2(matrix: Array, right: Array) -> Array:
     a, b, c, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 0], matrix[..., 1, 1]
     determinant = a * d - b * c
     determinant = np.where(np.abs(determinant) > 1e-6, determinant, 1.0)

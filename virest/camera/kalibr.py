@@ -13,15 +13,14 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.lens_fit import standard_lens
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.profile_file import parse_profile
 from virest.camera.yaml_mapping import commented
 from virest.errors import SettingsError
 
-Array = NDArray[np.float64]
 _DISTORTIONS = {
     "radtan": ("radtan", ("k1", "k2", "p1", "p2")),
     "equidistant": ("fisheye", ("k1", "k2", "k3", "k4")),

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from virest.arrays import Array
 from virest.camera.intrinsics import Intrinsics
 
-Array = NDArray[np.float64]
 GRID = (25, 19)
 """Grid over the picture on which the lenses are matched: ample for the eight parameters of a smooth lens."""
 

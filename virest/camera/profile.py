@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import Field as ModelField
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.response import ResponseCurve
@@ -97,6 +97,23 @@ class CameraProfile:
     """Principal point and distortion if known without the focal length; its own focal length is nominal."""
 
     @property
+    def curve(self) -> ResponseCurve:
+        """The response curve; sRGB if it is unknown."""
+        return self.response or ResponseCurve("srgb")
+
+    def with_curve(self, **changes: Any) -> CameraProfile:
+        """The profile with values of its curve replaced."""
+        return replace(self, response=replace(self.curve, **changes))
+
+    def with_shutter(self, **changes: Any) -> CameraProfile:
+        """The profile with values of its shutter replaced."""
+        return replace(self, shutter=replace(self.shutter, **changes))
+
+    def with_extensions(self, **changes: Any) -> CameraProfile:
+        """The profile with values of its extensions replaced."""
+        return replace(self, extensions=replace(self.extensions, **changes))
+
+    @property
     def fields(self) -> tuple[ModelField, ...]:
         """All fields: the shutter's, the lens's and the extensions'."""
         lens = self.intrinsics
@@ -126,20 +143,22 @@ class CameraProfile:
         lens = self.intrinsics
         if lens is None and displaced is not None:
             raise SettingsError("extensions.field: a displacement needs a focal length", hint="set intrinsics.fx_px")
-        return replace(
-            self,
-            shutter=replace(self.shutter, uneven=uneven),
-            intrinsics=None if lens is None else replace(lens, displaced=displaced),
-            extensions=replace(self.extensions, field=tuple(held[""])),
+        return (
+            replace(
+                self,
+                intrinsics=None if lens is None else replace(lens, displaced=displaced),
+            )
+            .with_shutter(uneven=uneven)
+            .with_extensions(field=tuple(held[""]))
         )
 
     @property
-    def rotation_cam_imu(self) -> NDArray[np.float64]:
+    def rotation_cam_imu(self) -> Array:
         """R_cam_imu, (3, 3)."""
         return np.array(self.r_cam_imu)
 
     @property
-    def pose_cam_imu(self) -> NDArray[np.float64]:
+    def pose_cam_imu(self) -> Array:
         """T_cam_imu, (4, 4): x_cam = T_cam_imu x_imu, metres."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.r_cam_imu, self.p_cam_imu_m

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from virest.arrays import Array
 from virest.camera.field import Field as ModelField
 from virest.camera.intrinsics import COEFFICIENT_NAMES, Intrinsics
 from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, Estimate, Extensions
@@ -109,7 +109,7 @@ def _pair(values: list[float]) -> tuple[float, float]:
     return values[0], values[1]
 
 
-def _nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nearest_rotation(matrix: Array) -> Array:
     u, _, vt = np.linalg.svd(matrix)
     rotation = u @ vt
     return np.where(np.abs(rotation - np.round(rotation)) < 1e-12, np.round(rotation), rotation)

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Mask
 from virest.errors import SettingsError
 
 KINDS = ("linear", "srgb", "gamma", "five_segment", "table")
@@ -94,14 +95,14 @@ class ResponseCurve:
         """
         return _slope_table(self).copy()
 
-    def censored_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
+    def censored_table(self, margin_levels: float = 0.5) -> Mask:
         """Mask (256,) of the grey levels without measured light: at or beyond A and D."""
         clipped = self.clipped_table(margin_levels)
         if self.light_range[0] <= 1e-3:
             return clipped
         return (np.arange(256) <= _end_levels(self)[0] + margin_levels) | clipped
 
-    def clipped_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
+    def clipped_table(self, margin_levels: float = 0.5) -> Mask:
         """Mask (256,) of the clipped grey levels, at or beyond D, where the light may have any strength."""
         return np.arange(256) >= min(_end_levels(self)[1], 255.0) - margin_levels
 

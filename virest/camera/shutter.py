@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import Field
 from virest.errors import SettingsError
 
@@ -42,7 +43,7 @@ class Shutter:
         """Whether the readout runs along x of the stored picture."""
         return self.readout_direction in ("left_to_right", "right_to_left")
 
-    def readout_fraction(self, points_px: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
+    def readout_fraction(self, points_px: NDArray[Any], width: int, height: int) -> Array:
         """Fraction s of the readout time at which pixels (..., 2) start, 0 for the first row read.
 
         Not clipped, so it is also valid slightly outside the picture.
@@ -52,7 +53,7 @@ class Shutter:
             return even
         return even + self.uneven.at(even)[..., 0] / self.readout_time_s
 
-    def row_fraction(self, points_px: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
+    def row_fraction(self, points_px: NDArray[Any], width: int, height: int) -> Array:
         """Position of pixels (..., 2) among the rows as a fraction, linear, 0 for the first row read."""
         points = np.asarray(points_px, float)
         match self.readout_direction:

@@ -20,6 +20,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.intrinsics import COEFFICIENT_NAMES
 from virest.camera.kalibr import ImuNoise, parse_camchain
 from virest.camera.profile import CameraProfile
@@ -49,8 +50,6 @@ IMU_HEADER = (
 )
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 """Rotation of a camera whose pose is not given."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

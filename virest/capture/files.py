@@ -12,6 +12,8 @@ CHUNK_BYTES = 1 << 20
 """Read at once, so that the memory does not grow with the file."""
 MAX_LINE_BYTES = 1 << 16
 """Real rows have up to about 200 bytes; a line above this limit is damage, or an attack on the memory."""
+MAX_TEXT_BYTES = 1 << 20
+"""The same of a small text file: real ones have a few kB."""
 MAX_TABLE_BYTES = 4 << 30
 """Four days of 500 Hz samples."""
 
@@ -105,12 +107,12 @@ def _check_chunk(chunk: bytes, run: int, name: str, error: type[CaptureError]) -
     return run
 
 
-def read_small_text(path: Path, max_bytes: int = 1 << 20, error: type[CaptureError] = CaptureError) -> str:
-    """Content of a small text file, undecodable bytes replaced. Raises ``error`` if it is irregular or too large."""
-    size = require_regular_file(path, error)
-    if size > max_bytes:
-        raise error(f"{label(path)}: {size} bytes, more than {max_bytes}", hint="is it the logger's file?")
+def read_small_text(path: Path) -> str:
+    """Content of a small text file, undecodable bytes replaced. Raises CaptureError if it is irregular or too large."""
+    size = require_regular_file(path, CaptureError)
+    if size > MAX_TEXT_BYTES:
+        raise CaptureError(f"{label(path)}: {size} bytes, more than {MAX_TEXT_BYTES}", hint="is it the logger's file?")
     try:
         return path.read_bytes().decode("utf-8-sig", errors="replace")
     except OSError as fault:
-        raise error(f"{label(path)}: {fault.strerror}", hint="check its permissions") from None
+        raise CaptureError(f"{label(path)}: {fault.strerror}", hint="check its permissions") from None

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.capture import startup as start
 from virest.capture.detect import read_source
 from virest.capture.imu import ImuSamples
@@ -70,11 +71,11 @@ class _Joined:
 
     stamps_ns: NDArray[np.int64]
     """(n,) stamp of each frame; from PTS where the row is missing."""
-    has_stamp: NDArray[np.bool_]
+    has_stamp: Mask
     stamp_0_ns: int
     metadata_rows: NDArray[np.int64]
     """(n,) −1 for none."""
-    unix_lag_s: NDArray[np.float64] | None
+    unix_lag_s: Array | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ class _Recording:
     joined: _Joined
     shift_ns: int
     """Added to the camera's stamps, for the IMU's clock."""
-    time_s: NDArray[np.float64]
+    time_s: Array
     """(n,) times of the frames from stamp_0."""
     imu: ImuSamples
     gaps: tuple[tuple[float, float], ...]
@@ -233,7 +234,7 @@ def _note_metadata(
         notes.append(Note("info", "metadata-spare", f"{spare} rows of {name} belong to no frame of the movie"))
 
 
-def _unix_lag_s(files: Source, alignment: Alignment, joined: NDArray[np.int64]) -> NDArray[np.float64] | None:
+def _unix_lag_s(files: Source, alignment: Alignment, joined: NDArray[np.int64]) -> Array | None:
     """Encoder output − capture result of each frame, from the two Unix columns; None if either is missing."""
     if files.stamps is None or files.metadata is None:
         return None
@@ -269,7 +270,7 @@ def _startup(recording: _Recording, look_at_pictures: bool) -> start.Startup:
     return replace(began, stalls=stalls)
 
 
-def _differences(files: Source, frames: Iterable[int], count: int) -> NDArray[np.float64]:
+def _differences(files: Source, frames: Iterable[int], count: int) -> Array:
     """(count,) difference of each picture to its predecessor, where both are among the frames (rising); else NaN."""
     pictures: list[NDArray[np.uint8] | None] = [None] * count
     for number, picture in read_gray(files.movie_path, files.movie, frames):
@@ -277,7 +278,7 @@ def _differences(files: Source, frames: Iterable[int], count: int) -> NDArray[np
     return start.picture_differences(pictures)
 
 
-def _later_repeats(files: Source, look: int, motion_px: NDArray[np.float64]) -> tuple[int, ...]:
+def _later_repeats(files: Source, look: int, motion_px: Array) -> tuple[int, ...]:
     """Frames after the start-up that repeat their predecessor; only frames of few bytes are decoded."""
     size = files.movie.packet_bytes
     if size is None or len(size) != len(motion_px):
@@ -370,7 +371,7 @@ def _exposures_s(recording: _Recording) -> list[float | None]:
     return [float(value) for value in np.interp(time_s, time_s[known], logged[known])]
 
 
-def _focal_scales(recording: _Recording) -> NDArray[np.float64] | None:
+def _focal_scales(recording: _Recording) -> Array | None:
     """Focal length of each frame over the median; None if it is not logged or does not change."""
     files, rows = recording.files, recording.joined.metadata_rows
     if files.metadata is None:
@@ -386,12 +387,12 @@ def _focal_scales(recording: _Recording) -> NDArray[np.float64] | None:
     return scales
 
 
-def _listed(numbers: Sequence[int] | NDArray[np.intp]) -> str:
+def _listed(numbers: Sequence[int] | Index) -> str:
     """The first numbers of the frames that a note is about."""
     return ", ".join(map(str, numbers[:MOST_LISTED])) + (" …" if len(numbers) > MOST_LISTED else "")
 
 
-def _value(column: NDArray[np.float64], row: int) -> float | None:
+def _value(column: Array, row: int) -> float | None:
     return float(column[row]) if row >= 0 and np.isfinite(column[row]) else None
 
 

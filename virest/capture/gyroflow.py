@@ -16,8 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import LANDSCAPE_R_CAM_IMU, CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.files import label, scan_text
@@ -116,7 +116,7 @@ def read_log(path: Path, header: dict[str, str]) -> GyroTable:
     return replace(table, time_ns=table.time_ns + ORIGIN_NS)
 
 
-def orientation_matrix(letters: str, name: str = "orientation") -> NDArray[np.float64]:
+def orientation_matrix(letters: str, name: str = "orientation") -> Array:
     """(3, 3) that takes logged columns to Gyroflow's X, Y, Z: letter i names the column that is axis i.
 
     A reflection is accepted, as in Gyroflow: some loggers have left-handed axes.  Raises ImuError for letters that do

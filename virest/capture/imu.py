@@ -5,18 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from virest.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
 class ImuSamples:
     """Gyroscope and accelerometer, IMU axes, IMU clock; strictly rising, no NaN in time or gyroscope."""
 
-    time_s: NDArray[np.float64]
+    time_s: Array
     """(n,) seconds counted from the capture's first stamp (row 0 of the frame stamps)."""
-    gyro_rad_s: NDArray[np.float64]
+    gyro_rad_s: Array
     """(n, 3) angular rate."""
-    accel_m_s2: NDArray[np.float64]
+    accel_m_s2: Array
     """(n, 3) specific force, +9.8 upwards at rest; NaN without an accelerometer."""
 
     def __len__(self) -> int:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.capture.records import IMU_GAP, NO_IMU
 from virest.capture.tables import EdgeEpochs
 from virest.errors import ClockError
@@ -187,12 +188,12 @@ def consecutive_runs(numbers: Iterable[int] | Int64) -> list[tuple[int, int]]:
 # ── coverage ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def median_period_s(time_s: NDArray[np.float64]) -> float:
+def median_period_s(time_s: Array) -> float:
     """Median step, 0 for fewer than two."""
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
 
 
-def find_gaps(time_s: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
+def find_gaps(time_s: Array) -> tuple[tuple[float, float], ...]:
     """(start, end) of each step longer than GAP_PERIODS median steps and than GAP_FLOOR_S."""
     steps = np.diff(time_s)
     limit = max(GAP_PERIODS * median_period_s(time_s), GAP_FLOOR_S)
@@ -202,7 +203,7 @@ def find_gaps(time_s: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
 def outside_reason(
     start_s: float,
     end_s: float,
-    time_s: NDArray[np.float64],
+    time_s: Array,
     gaps_s: tuple[tuple[float, float], ...],
     period_s: float | None = None,
 ) -> tuple[str, str] | None:

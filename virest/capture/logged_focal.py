@@ -7,9 +7,9 @@ it depends neither on the pixels that the logger counts in nor on the profile th
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from virest.arrays import Array
+
 VISIBLE_PX = 0.1
 """Smaller displacements of the picture's corner are below the tracking noise."""
 ONE_LENS = (0.5, 2.0)

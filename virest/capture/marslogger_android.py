@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Mask
 from virest.capture.files import TextScan, label, read_small_text, scan_text
 from virest.capture.tables import (
     DAMAGED_TIME,
@@ -147,7 +147,7 @@ def _count_rows(times: Int64, dropped: Counter[str]) -> int:
     return len(times) + sum(dropped.values())
 
 
-def _keep_times(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.bool_]:
+def _keep_times(times: Int64, path: Path, dropped: Counter[str]) -> Mask:
     """Mask of times that rise strictly.
 
     Times of zero or below are invalid first samples, unless the clock passes through zero: the next positive time is
@@ -199,7 +199,7 @@ def read_gyro_accel(path: Path) -> GyroTable:
     return make_gyro_table(path, time_ns, samples, rows, dict(+dropped))
 
 
-def _written_twice(time_ns: Int64, samples: Float64) -> NDArray[np.bool_]:
+def _written_twice(time_ns: Int64, samples: Float64) -> Mask:
     """Rows that repeat their predecessor, time included; equal times alone would be lost precision."""
     again = np.zeros(len(time_ns), bool)
     same = (samples[1:] == samples[:-1]) | (np.isnan(samples[1:]) & np.isnan(samples[:-1]))

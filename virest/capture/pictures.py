@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Mask
 from virest.capture.files import label, require_regular_file, scan_text
 from virest.capture.location import is_remote
 from virest.capture.marslogger_android import STAMPS, read_frame_timestamps
@@ -202,7 +203,7 @@ def _join(place: str, name: str, path: Path) -> str:
     return str(PurePosixPath(place) / name)
 
 
-def _existing(base: Path, names: list[str]) -> NDArray[np.bool_]:
+def _existing(base: Path, names: list[str]) -> Mask:
     """(n,) which names are regular files, listing each folder once."""
     inside = {folder: set(_pictures(base / folder)) for folder in {str(PurePosixPath(n).parent) for n in names}}
     parts = [PurePosixPath(name) for name in names]

@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
+
 KR_KB = {
     1: (0.2126, 0.0722),  # BT.709
     4: (0.30, 0.11),  # FCC
@@ -59,7 +61,7 @@ def _tables(matrix: int, full_range: bool) -> _ColourTables:
     luma = code if full_range else (code - 16) * (255 / 219)
     chroma = (code - 128) * (1.0 if full_range else 255 / 224)
 
-    def fixed(values: NDArray[np.float64]) -> NDArray[np.int16]:
+    def fixed(values: Array) -> NDArray[np.int16]:
         return np.rint(values * FIXED_POINT).astype(np.int16)
 
     return _ColourTables(

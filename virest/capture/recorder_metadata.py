@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.capture.records import CaptureMetadata, Note
 from virest.capture.source import Source
 
@@ -46,7 +46,7 @@ def summarise(files: Source, notes: list[Note]) -> CaptureMetadata:
     )
 
 
-def _median(values: NDArray[np.float64]) -> float | None:
+def _median(values: Array) -> float | None:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else None
 

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Picture
 from virest.capture.files import label
 from virest.errors import CaptureError
 
-Picture = NDArray[np.uint8]
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 IMU, CAMERA = "sensor_msgs/msg/Imu", "sensor_msgs/msg/CameraInfo"
 ENDINGS = (".bag", ".mcap", ".db3")
@@ -42,7 +42,7 @@ class BagCamera:
 
     width: int
     height: int
-    matrix: NDArray[np.float64]
+    matrix: Array
     """(3, 3)"""
     model: str
     distortion: tuple[float, ...]
@@ -105,7 +105,7 @@ class Bag:
                 )
         return None
 
-    def samples(self, topic: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def samples(self, topic: str) -> tuple[NDArray[np.int64], Array]:
         """Times (n,), ns, and rates and specific force (n, 6), rad/s and m/s²."""
         times, rows = [], []
         for time_ns, message in self._messages(topic):

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.capture.join import consecutive_runs
 
 LOOK_S = 2.0
@@ -60,7 +61,7 @@ class Startup:
     """Delay from capture to encoder output at the first frame and in steady state; None: no Unix columns."""
 
 
-def picture_differences(pictures: list[NDArray[np.uint8] | None]) -> NDArray[np.float64]:
+def picture_differences(pictures: list[NDArray[np.uint8] | None]) -> Array:
     """(n,) mean absolute difference of each picture to its predecessor, grey levels; NaN if either is missing."""
     differences = np.full(len(pictures), np.nan)
     for i in range(1, len(pictures)):
@@ -70,7 +71,7 @@ def picture_differences(pictures: list[NDArray[np.uint8] | None]) -> NDArray[np.
     return differences
 
 
-def find_repeats(differences: NDArray[np.float64], motion_px: NDArray[np.float64]) -> tuple[int, ...]:
+def find_repeats(differences: Array, motion_px: Array) -> tuple[int, ...]:
     """Frames that repeat their predecessor although the phone rotated.
 
     differences: (n,) of :func:`picture_differences`; motion_px: (n,) of :func:`expected_motion_px`.
@@ -85,12 +86,12 @@ def find_repeats(differences: NDArray[np.float64], motion_px: NDArray[np.float64
 
 
 def expected_motion_px(
-    frame_time_s: NDArray[np.float64],
-    imu_time_s: NDArray[np.float64],
-    gyro_rad_s: NDArray[np.float64],
+    frame_time_s: Array,
+    imu_time_s: Array,
+    gyro_rad_s: Array,
     focal_px: float,
     period_s: float,
-) -> NDArray[np.float64]:
+) -> Array:
     """(n,) motion of the picture's centre, px per frame, from the phone's mean rotation rate around each frame."""
     speed = np.linalg.norm(gyro_rad_s[:, :2], axis=1)
     total = np.concatenate([[0.0], np.cumsum(speed)])
@@ -115,7 +116,7 @@ def suspects(packet_bytes: NDArray[np.int64], keyframes: tuple[int, ...], first:
 
 
 def find_stalls(
-    repeats: tuple[int, ...], unix_lag_s: NDArray[np.float64] | None, first: int, period_s: float
+    repeats: tuple[int, ...], unix_lag_s: Array | None, first: int, period_s: float
 ) -> tuple[tuple[int, int], ...]:
     """(first, last) of the runs of frames from ``first`` on that may show later content than their timestamps.
 
@@ -133,9 +134,7 @@ def find_stalls(
     return tuple(consecutive_runs(late))
 
 
-def judge_startup(
-    unix_lag_s: NDArray[np.float64] | None, repeats: tuple[int, ...], frame_count: int, period_s: float
-) -> Startup:
+def judge_startup(unix_lag_s: Array | None, repeats: tuple[int, ...], frame_count: int, period_s: float) -> Startup:
     """Combine both kinds of evidence.
 
     unix_lag_s: (n,) encoder output − capture result of each frame, NaN where unknown; None without Unix columns.
@@ -151,7 +150,7 @@ def judge_startup(
     return Startup(frames, max(fallen, len(repeats) * period_s), repeats, unix_lag_s=shown)
 
 
-def _unix_witness(lag_s: NDArray[np.float64] | None, period_s: float) -> tuple[float | None, float | None, int]:
+def _unix_witness(lag_s: Array | None, period_s: float) -> tuple[float | None, float | None, int]:
     """(lag of the first frame, steady lag, number of leading frames above the steady lag by more than a period)."""
     if lag_s is None or np.isfinite(lag_s).sum() < MIN_LAGS:
         return None, None, 0

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.capture.files import label, scan_text
 from virest.errors import CaptureError, ClockError, ImuError, one_line
 
@@ -31,7 +32,7 @@ MAX_RATE_RAD_S = 200.0
 """The full scale of phone gyroscopes is 35 rad/s (2000 °/s); a row above this limit is damaged."""
 
 Int64 = NDArray[np.int64]
-Float64 = NDArray[np.float64]
+Float64 = Array
 
 INTEGER = re.compile(r"[+-]?(?:\d{1,18}|[0-8]\d{18}|9[01]\d{17})")
 """An integer that fits in 64 bits; Unix nanoseconds have 19 digits."""
@@ -153,7 +154,7 @@ def whole_numbers(column: Any) -> Int64:
     return values
 
 
-def strictly_rising(times: Int64) -> tuple[NDArray[np.bool_], dict[str, int]]:
+def strictly_rising(times: Int64) -> tuple[Mask, dict[str, int]]:
     """Mask of the rows to keep so that times rise strictly, and the number of dropped rows by reason.
 
     Of equal times the first is kept.  A single time far ahead of its successors is dropped alone: if dropping all later
@@ -176,7 +177,7 @@ def strictly_rising(times: Int64) -> tuple[NDArray[np.bool_], dict[str, int]]:
     return keep, {reason: count for reason, count in counts.items() if count}
 
 
-def _longest_rising(values: Int64) -> NDArray[np.bool_]:
+def _longest_rising(values: Int64) -> Mask:
     """Mask of a longest strictly rising subsequence (patience sorting)."""
     tails: list[int] = []
     tail_rows: list[int] = []
@@ -198,7 +199,7 @@ def _longest_rising(values: Int64) -> NDArray[np.bool_]:
     return mask
 
 
-def keep_rising(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.bool_]:
+def keep_rising(times: Int64, path: Path, dropped: Counter[str]) -> Mask:
     """The mask of :func:`strictly_rising`, dropped rows counted. Raises ClockError if most rows would be dropped."""
     keep, lost = strictly_rising(times)
     if len(times) > 2 and keep.sum() * 2 <= len(times):
@@ -213,7 +214,7 @@ def keep_rising(times: Int64, path: Path, dropped: Counter[str]) -> NDArray[np.b
 
 # ── any table of numbers ─────────────────────────────────────────────────────────────────────────────────────────
 
-Times = Callable[[Any, Path], tuple[Int64, NDArray[np.bool_]]]
+Times = Callable[[Any, Path], tuple[Int64, Mask]]
 """Text of the first column to (integer nanoseconds, mask of the rows that have a time)."""
 
 
@@ -229,7 +230,7 @@ class Rows:
     dropped: dict[str, int]
 
 
-def exact_times_ns(text: Any, path: Path, *, whole_are_seconds: bool = False) -> tuple[Int64, NDArray[np.bool_]]:
+def exact_times_ns(text: Any, path: Path, *, whole_are_seconds: bool = False) -> tuple[Int64, Mask]:
     """Integer nanoseconds of times written as such or as decimal seconds, truncated below 1 ns.
 
     Raises ClockError for exponents, which a spreadsheet writes after it has lost the nanoseconds.
@@ -254,7 +255,7 @@ def exact_times_ns(text: Any, path: Path, *, whole_are_seconds: bool = False) ->
 def scaled_times_ns(scale_s: float) -> Times:
     """A reader of times counted in units of ``scale_s`` seconds."""
 
-    def read(text: Any, _path: Path) -> tuple[Int64, NDArray[np.bool_]]:
+    def read(text: Any, _path: Path) -> tuple[Int64, Mask]:
         values = numbers(text) * (scale_s * 1e9)
         known = np.isfinite(values) & (np.abs(values) < 2.0**62)
         return np.rint(np.where(known, values, 0.0)).astype(np.int64), known

@@ -22,6 +22,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.capture.coding_step import coding_step
 from virest.capture.files import label, require_regular_file
 from virest.capture.location import RemotePath, unreachable
@@ -90,7 +91,7 @@ class MovieIndex:
         return len(self.pts_ticks)
 
     @property
-    def pts_s(self) -> NDArray[np.float64]:
+    def pts_s(self) -> Array:
         """(n,) presentation times, seconds from the first frame; exact to 2^-53 of the value."""
         ticks = self.pts_ticks - self.pts_ticks[0]
         return ticks * self.time_base.numerator / self.time_base.denominator

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import STAMP_FRACTION
 from virest.diagnosis import picture_ladder
 from virest.diagnosis.candidates import varies
 from virest.diagnosis.findings import Finding, ParameterChange, Rival
 from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.diagnosis.tracking_stage import with_flicker_of
 
-Array = NDArray[np.float64]
 COINCIDENCE_SIGMA, COINCIDENCE_PART = 3.5, 0.25
 """An offset is attributed to another timestamp reference if it agrees within this many standard deviations and within
 this part of the reference's own shift: a deviation that an unmodelled effect has widened agrees with everything."""
@@ -57,11 +57,8 @@ def offset_as_timestamp(geometric: GeometricVerdict, findings: list[Finding], ex
                 sentence=f"a frame's stamp means its {meaning}; or the clocks differ by {shift:.4g} s",
             )
         )
-        shutter = replace(geometric.model.profile.shutter, timestamp=meaning)
-        geometric.model = replace(
-            geometric.model,
-            profile=replace(geometric.model.profile, shutter=shutter, time_offset_s=nominal.time_offset_s),
-        )
+        profile = replace(geometric.model.profile.with_shutter(timestamp=meaning), time_offset_s=nominal.time_offset_s)
+        geometric.model = replace(geometric.model, profile=profile)
     return result
 
 
@@ -111,33 +108,12 @@ def as_exposure(findings: Sequence[Finding], change: ParameterChange) -> Finding
     )
 
 
-def one_exposure(blurred: picture_ladder.PictureVerdict) -> picture_ladder.PictureVerdict:
-    """Drop the blur-based exposure finding; tracked points already determined it."""
-    blurred.findings = [finding for finding in blurred.findings if finding.name != "exposure_time"]
-    return blurred
-
-
-def exposed(profile: CameraProfile, scale: float) -> CameraProfile:
-    """The profile with this exposure scale."""
-    return replace(profile, shutter=replace(profile.shutter, exposure_scale=scale))
-
-
-def merged(
-    moved: CameraProfile,
-    lit: CameraProfile,
-    blurred: CameraProfile,
-    is_exposure: bool,
-) -> CameraProfile:
+def merged(moved: CameraProfile, lit: CameraProfile, blurred: CameraProfile, is_exposure: bool) -> CameraProfile:
     """Combine all causes in one profile: geometry from ``moved``, photometry from ``lit``, blur from ``blurred``."""
     light = lit.extensions
-    extensions = replace(
-        moved.extensions,
+    found = with_flicker_of(replace(moved, response=lit.response), lit).with_extensions(
         vignetting_corner_loss=light.vignetting_corner_loss,
-        flicker_amplitude=light.flicker_amplitude,
-        flicker_frequency_hz=light.flicker_frequency_hz,
-        flicker_phase_rad=light.flicker_phase_rad,
         gain=light.gain,
         defocus_sigma_px=blurred.extensions.defocus_sigma_px,
     )
-    shutter = moved.shutter if is_exposure else replace(moved.shutter, exposure_scale=blurred.shutter.exposure_scale)
-    return replace(moved, response=lit.response, extensions=extensions, shutter=shutter)
+    return found if is_exposure else found.with_shutter(exposure_scale=blurred.shutter.exposure_scale)

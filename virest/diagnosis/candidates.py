@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
 from virest.diagnosis.geometric_evidence import Evidence, Model, free_scene
@@ -16,7 +16,6 @@ from virest.inference.recorder_lag import Schedule
 from virest.inference.track_fit import Term
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
 SCREEN_POINTS = 1500
 """Points used to screen a cause."""
 CLOCKS = ("time_offset", "clock_skew")
@@ -89,12 +88,7 @@ def _median_residual_px(evidence: Evidence, model: Model, table: TrackTable) -> 
 
 
 def candidates_of(
-    evidence: Evidence,
-    nominal: CameraProfile,
-    model: Model,
-    tried: set[str],
-    lags: Sequence[Schedule],
-    far: FarStart,
+    evidence: Evidence, nominal: CameraProfile, model: Model, tried: set[str], lags: Sequence[Schedule], far: FarStart
 ) -> list[Candidate]:
     """All causes that are not in the model yet, each at all its starting points.
 
@@ -103,7 +97,9 @@ def candidates_of(
     in_terms = {term.name for term in model.terms}
     found: list[Candidate] = []
     for effect in GEOMETRIC_EFFECTS:
-        if effect.name in tried or effect.name in in_terms or not _is_identifiable(evidence, effect):
+        # a constant exposure is indistinguishable from an offset
+        unknowable = effect.name == "exposure_time" and not varies(evidence.observed.exposure_s)
+        if effect.name in tried or effect.name in in_terms or unknowable:
             continue
         if effect.term is None:
             found += _word_candidates(effect, model)
@@ -118,11 +114,6 @@ def candidates_of(
     if "frame_lag" not in tried:
         found += [_lag_candidate(model, *lag) for lag in lags]
     return found
-
-
-def _is_identifiable(evidence: Evidence, effect: GeometricEffect) -> bool:
-    """Whether points can identify this cause: a constant exposure time is indistinguishable from an offset."""
-    return effect.name != "exposure_time" or varies(evidence.observed.exposure_s)
 
 
 def varies(exposure_s: Array) -> bool:
@@ -153,7 +144,5 @@ def _depth_candidates(evidence: Evidence, model: Model, tried: set[str]) -> list
 
 
 def _lag_candidate(model: Model, lag_s: float, frames: int, by_frame: tuple[float, ...]) -> Candidate:
-    extensions = replace(model.profile.extensions, frame_lag_s=lag_s, frame_lag_frames=frames)
-    return Candidate(
-        "frame_lag", replace(model, profile=replace(model.profile, extensions=extensions), lag=by_frame), (), None
-    )
+    profile = model.profile.with_extensions(frame_lag_s=lag_s, frame_lag_frames=frames)
+    return Candidate("frame_lag", replace(model, profile=profile, lag=by_frame), (), None)

@@ -6,27 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
-from virest.diagnosis.geometric_evidence import (
-    ITERATIONS,
-    Evidence,
-    Model,
-    capped_rms,
-    fit_model,
-    relief_loss,
-)
+from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, fit_model, relief_loss
 from virest.image_formation.point_model import TrackTable
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.parallel import ParallelMap
 from virest.inference.time_blocks import halves
 from virest.inference.track_fit import Term
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 JUDGE_POINTS = 3500
+"""Points used to judge a cause; half of them fit it."""
 LAGGING_BLOCK = 2
 """Pairs per block among those that a start-up lag moves: only neighbouring pairs share a frame and its errors."""
 

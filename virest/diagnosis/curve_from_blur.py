@@ -28,12 +28,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.pixels import BT601_LUMA
 from virest.capture.records import Frame
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
-from virest.diagnosis.photometry import Array, Indices, Mask
 from virest.diagnosis.photometry_patches import GrayFrame, path_over_exposure, registered_points
 from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
 from virest.image_formation.turning_camera import TurningCamera, turning_camera
@@ -41,6 +41,7 @@ from virest.image_formation.warp import moved_between
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.robust import robust_std
+from virest.inference.time_blocks import evenly_chosen
 from virest.motion.trajectory import Trajectory
 
 Gray = NDArray[np.uint8]
@@ -62,6 +63,12 @@ CODING_STD = {"response_curve": (0.02, 0.1), "black_level": (0.01, 0.1)}
 AGREEMENT = 0.07
 """Correlation of coding residuals with a curve change, measured on movies of 0.1 to 0.4 bit per pixel with the
 profile's curve."""
+MOST_PAIRS, REACH_FRAMES = 16, 8
+"""Pairs of frames that are compared, and the most frames between a blurred frame and its sharp one."""
+BLURRED_PX, SHARP_PX, SHARP_PART = (3.5, 16.0), 3.0, 0.45
+"""Path lengths of blurred frames; the most of a sharp one, in px and as a part of the blurred one's."""
+TILE_PX, MOST_TILES = 80, 60
+"""Side of a tile, and tiles per pair, evenly spaced over the frame; more add no information."""
 READ_PARTS = 4
 """Number of parts in which frames are read in parallel."""
 _MIN_TILE_PIXELS = 400
@@ -75,25 +82,10 @@ _MAX_CHROMA_RANGE = 40
 
 
 @dataclass(frozen=True, slots=True)
-class MixingSettings:
-    """Which frames are compared. Lengths in pixels."""
-
-    pairs: int = 16
-    blurred_px: tuple[float, float] = (3.5, 16.0)
-    sharp_px: float = 3.0
-    sharp_part: float = 0.45
-    """The sharp frame's path is at most this part of the blurred one's."""
-    reach_frames: int = 8
-    tile_px: int = 80
-    tiles: int = 60
-    """Maximum number of tiles per pair, evenly spaced over the frame; more add no information."""
-
-
-@dataclass(frozen=True, slots=True)
 class MixingEvidence:
     """Evidence of each tile of each pair; scores are residuals projected on the effect of a curve change."""
 
-    pair: Indices
+    pair: Index
     """(n,) number of the pair of frames."""
     pixels: Array
     """(n,) weighted number of compared pixels, every second one along both axes."""
@@ -112,16 +104,11 @@ class MixingEvidence:
 
     def subset(self, use: Mask) -> MixingEvidence:
         """Only the chosen tiles."""
-        return MixingEvidence(
-            self.pair[use],
-            self.pixels[use],
-            self.noise[use],
-            self.darkest,
-            self.steps,
-            {name: v[use] for name, v in self.stiffness.items()},
-            {name: v[use] for name, v in self.score.items()},
-            {name: v[use] for name, v in self.rest.items()},
+        stiffness, score, rest = (
+            {name: v[use] for name, v in kind.items()} for kind in (self.stiffness, self.score, self.rest)
         )
+        pair, pixels, noise = self.pair[use], self.pixels[use], self.noise[use]
+        return MixingEvidence(pair, pixels, noise, self.darkest, self.steps, stiffness, score, rest)
 
     @property
     def largest_black(self) -> float:
@@ -160,13 +147,11 @@ def observe_mixing(
     frames: Sequence[Frame],
     trajectory: Trajectory,
     profile: CameraProfile,
-    settings: MixingSettings | None = None,
     each: ParallelMap = one_by_one,
 ) -> MixingEvidence:
     """Compare blurred frames with sharp ones near them. Empty if the motion provides no such pairs."""
-    settings = settings or MixingSettings()
     camera = turning_camera(trajectory, profile) if profile.intrinsics is not None else None
-    pairs = _choose_pairs(frames, camera, settings) if camera is not None else []
+    pairs = _choose_pairs(frames, camera) if camera is not None else []
     wanted = sorted({k for pair in pairs for k in pair})
     runs = [part.tolist() for part in np.array_split(np.array(wanted, np.intp), READ_PARTS)]
     read = each(_read_part, [(read_rgb, run) for run in runs if run])
@@ -175,7 +160,7 @@ def observe_mixing(
     darkest = _darkest(list(pictures.values()))
     steps = _steps(darkest)
     known = [number for number, pair in enumerate(pairs) if pair[0] in pictures and pair[1] in pictures]
-    calls = [(*((by_index[k], pictures[k]) for k in pairs[number]), camera, settings, steps) for number in known]
+    calls = [(*((by_index[k], pictures[k]) for k in pairs[number]), camera, steps) for number in known]
     compared = each(_compare, calls)
     rows = [(number, row) for number, found in zip(known, compared, strict=True) for row in found]
     table = np.array([row for _, row in rows]).reshape(-1, 12)
@@ -219,7 +204,7 @@ def estimate_mixing(evidence: MixingEvidence, profile: CameraProfile, effect_nam
     std = float(np.sqrt(jackknife + absolute**2 + (AGREEMENT / max(strength, 1e-6)) ** 2))
     p_value = 2 * student_tail(abs(change) / std, len(pairs) - 1)
     std = float(np.hypot(std, relative * change))
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     if effect_name == "response_curve":
         value = curve.extra_gamma * float(np.exp(change))
         return MixingEstimate(value, std * value, p_value, len(pairs))
@@ -241,8 +226,7 @@ def judge_mixing(evidence: MixingEvidence, effect_name: str) -> HeldOutGain | No
         change = _root(evidence.subset(np.isin(evidence.pair, pairs[odd::2])), effect_name)
         held = evidence.subset(np.isin(evidence.pair, pairs[1 - odd :: 2]))
         squares = (held.mean_square(effect_name, 0.0)[0], *held.mean_square(effect_name, change))
-        before, after, noise = np.sqrt(squares).tolist()
-        folds.append((before, after, noise))
+        folds.append(tuple(np.sqrt(squares).tolist()))
     return HeldOutGain.of_folds(PHOTOMETRY, folds)
 
 
@@ -260,19 +244,19 @@ def _root(evidence: MixingEvidence, effect_name: str) -> float:
 # ── pairs of frames ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _choose_pairs(frames: Sequence[Frame], camera: TurningCamera, settings: MixingSettings) -> list[tuple[int, int]]:
+def _choose_pairs(frames: Sequence[Frame], camera: TurningCamera) -> list[tuple[int, int]]:
     """(sharp, blurred) movie indices with the most blur between them."""
     if any(frame.exposure_s is None for frame in frames) or len(frames) < 2:
         return []
     length = _central_blur_px(frames, camera)
     index = np.array([frame.index for frame in frames])
     found = []
-    for i in np.flatnonzero((length > settings.blurred_px[0]) & (length < settings.blurred_px[1])):
-        near = np.flatnonzero(np.abs(index - index[i]) <= settings.reach_frames)
+    for i in np.flatnonzero((length > BLURRED_PX[0]) & (length < BLURRED_PX[1])):
+        near = np.flatnonzero(np.abs(index - index[i]) <= REACH_FRAMES)
         best = near[np.argmin(length[near])]
-        if length[best] < min(settings.sharp_px, settings.sharp_part * length[i]):
+        if length[best] < min(SHARP_PX, SHARP_PART * length[i]):
             found.append((float(length[i] - 1.5 * length[best]), int(index[best]), int(index[i])))
-    return [(sharp, blurred) for _, sharp, blurred in sorted(found, reverse=True)[: settings.pairs]]
+    return [(sharp, blurred) for _, sharp, blurred in sorted(found, reverse=True)[:MOST_PAIRS]]
 
 
 def _central_blur_px(frames: Sequence[Frame], camera: TurningCamera) -> Array:
@@ -291,11 +275,7 @@ def _darkest(pictures: Sequence[Rgb]) -> float:
 
 
 def _compare(
-    sharp: tuple[Frame, Rgb],
-    blurred: tuple[Frame, Rgb],
-    camera: TurningCamera,
-    settings: MixingSettings,
-    steps: dict[str, Array],
+    sharp: tuple[Frame, Rgb], blurred: tuple[Frame, Rgb], camera: TurningCamera, steps: dict[str, Array]
 ) -> list[Array]:
     """Pixels, noise, and for each effect stiffness, scores and rest, (12,) in all, of each usable tile of one pair."""
     height, width = blurred[1].shape[:2]
@@ -306,16 +286,16 @@ def _compare(
     x, y = ((np.arange(n) / _NODE_PX).astype(np.float32) for n in (width, height))
     place = cv2.remap(where, np.tile(x, (height, 1)), np.tile(y[:, None], (1, width)), cv2.INTER_LINEAR)
     usable = _usable(sharp[1], blurred[1], place)
-    tiles = _tiles(width, height, settings.tile_px)
+    tiles = _tiles(width, height, TILE_PX)
     middles = np.array([((t[1].start + t[1].stop) / 2, (t[0].start + t[0].stop) / 2) for t in tiles])
     kernels = [
         [_kernel(path) for path in path_over_exposure(middles, frame, camera)] for frame in (sharp[0], blurred[0])
     ]
-    chosen = _evenly_chosen([k for k, tile in enumerate(tiles) if _is_usable(usable[tile])], settings.tiles)
+    chosen = evenly_chosen(np.flatnonzero([_is_usable(usable[tile]) for tile in tiles]), MOST_TILES).tolist()
     pixels = [_compared(usable, tiles[k]) for k in chosen]
     if not chosen:
         return []
-    curve = camera.profile.response or ResponseCurve("srgb")
+    curve = camera.profile.curve
 
     def light(seen: ResponseCurve) -> list[tuple[Plane, list[Plane]]]:
         """Light of both frames, aligned to the blurred one, each with the other's kernels."""
@@ -349,17 +329,12 @@ def _compare(
     return [_tile_scores([stack[part] for stack in stacks], tuple(steps.values()), free[part]) for part in parts]
 
 
-def _evenly_chosen(numbers: list[int], count: int) -> list[int]:
-    """At most ``count`` of the numbers, evenly spaced."""
-    return [numbers[k] for k in np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int))]
-
-
 def _is_usable(usable: Mask) -> bool:
     """Whether enough of a tile's pixels can be compared."""
     return bool(usable.sum() >= 2 * _MIN_TILE_PIXELS and usable[::_EVERY, ::_EVERY].sum() >= _MIN_TILE_PIXELS)
 
 
-def _compared(usable: Mask, tile: tuple[slice, slice]) -> tuple[Indices, Indices]:
+def _compared(usable: Mask, tile: tuple[slice, slice]) -> tuple[Index, Index]:
     """Rows and columns, within a tile, of the pixels to compare."""
     row, column = np.nonzero(usable[tile][::_EVERY, ::_EVERY])
     return row * _EVERY, column * _EVERY

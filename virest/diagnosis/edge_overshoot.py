@@ -22,10 +22,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
+from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.diagnosis.findings import EDGES, Finding, HeldOutGain, ParameterChange, Rung
@@ -42,9 +42,8 @@ from virest.inference.time_blocks import halves
 from virest.inference.unsharp_mask import SHARPEST
 from virest.motion.trajectory import Trajectory, turned
 
-Array = NDArray[np.float64]
-
 MIN_USED = 60
+"""Fewest of the sharpest edges from which a mask is fitted."""
 LOCATION_PX, LOCATION_GROUPS = 20.0, 16
 """Cell size of a scene location: edges whose world directions share a cell, at the lens's focal length, show the same
 location; and the number of location groups of the jackknife."""
@@ -66,6 +65,7 @@ SIZE_ERROR = 0.2
 SAME_SIGMA = 3.0
 """A mask that differs from the recorded one by fewer deviations is the same."""
 BOUNDS = ([0.2, 0.0, np.log(0.4)], [3.0, 6.0, np.log(4.0)])
+"""Of the edge width (px), the amount, and the logarithm of the radius, which lie 2.4 and 2.7 σ from its prior."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class EdgeProfiles:
     """(n,) half of the distance between 0.16 and 0.84."""
     stamp_s: Array
     """(n,) of the frame."""
-    place: NDArray[np.intp]
+    place: Index
     """(n,) number of the scene location."""
 
     def __len__(self) -> int:
@@ -200,13 +200,13 @@ def sharpened_step(width_px: float, amount: float, radius_px: float) -> Array:
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _locations(ways: Array, focal_px: float) -> NDArray[np.intp]:
+def _locations(ways: Array, focal_px: float) -> Index:
     """Number (n,) of the scene location in each world direction (n, 3)."""
     cell = np.floor(ways / np.linalg.norm(ways, axis=-1, keepdims=True) * focal_px / LOCATION_PX)
     return np.unique(cell, axis=0, return_inverse=True)[1].ravel()
 
 
-def _measured(profiles: Array, stamp_s: Array, place: NDArray[np.intp]) -> EdgeProfiles:
+def _measured(profiles: Array, stamp_s: Array, place: Index) -> EdgeProfiles:
     near = np.abs(GRID_PX) <= 3.0
     width = crossing(profiles[:, near], 0.84, GRID_PX[near]) - crossing(profiles[:, near], 0.16, GRID_PX[near])
     return EdgeProfiles(profiles, 0.5 * width, stamp_s, place)
@@ -251,7 +251,7 @@ def _jackknife(values: Sequence[Array]) -> Array:
     return np.asarray(away.T @ away * (len(values) - 1) / len(values))
 
 
-def _held_out(profiles: Array, block: NDArray[np.intp]) -> HeldOutGain:
+def _held_out(profiles: Array, block: Index) -> HeldOutGain:
     """Held-out rms of the mean profile of every other block, step fitted to the rest, without and with a mask."""
     seen, judged = (_symmetrised(np.median(profiles[use], axis=0)) for use in halves(block))
     width = least_squares(lambda s: sharpened_step(s[0], 0.0, 1.0) - seen, [0.7], bounds=(BOUNDS[0][0], BOUNDS[1][0]))

@@ -8,9 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import ParameterChange
 from virest.effects.records import Effect
@@ -19,8 +17,6 @@ from virest.inference.profile_terms import PLAIN_READOUT, TERMS
 from virest.inference.track_fit import Term
 
 __all__ = ["GEOMETRIC_EFFECTS", "PLAIN_READOUT", "GeometricEffect"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

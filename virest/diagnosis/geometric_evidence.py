@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.calibration.physical_limits import impossible
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
@@ -23,22 +23,6 @@ from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directio
 from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import InertialMotion, Motion
 
-__all__ = [
-    "Evidence",
-    "Model",
-    "base_scene",
-    "capped_rms",
-    "depth_of",
-    "distances",
-    "fit_model",
-    "free_scene",
-    "loss",
-    "make_evidence",
-    "relief_loss",
-]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 CAP = 4.0
 """Residual cap, in median scales, so that single lost tracks do not dominate."""
 BLOCK_LENGTHS = (7, 11, 8, 13, 9)
@@ -52,6 +36,7 @@ MAX_DEPTH_PULL, HELD_DEPTH_STD = 4.0, 1e-3
 HELD_DEPTH_STD), so that this depth is judged."""
 ITERATIONS = 10
 MIN_SWAY_DEPTH_PER_M = 1e-4
+"""Smallest inverse depth: that of the farthest scene (physical_limits.DEPTH_M)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +56,7 @@ class Evidence:
 
     imu: ImuSamples
     observed: ObservedTracks
-    block: NDArray[np.intp]
+    block: Index
     """(pairs,) number of the time block."""
     break_s: Array
     """Times (breaks,) at which the path from the accelerometer is unknown, camera clock."""

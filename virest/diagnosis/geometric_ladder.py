@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 PROMISING = 3
 """Number of causes that each fold may choose from."""
-MAX_P, MIN_GAIN, LARGE_GAIN = POINT_LEVELS.max_p, POINT_LEVELS.least_gain, POINT_LEVELS.evenness[-1][0]
+MIN_GAIN, LARGE_GAIN = POINT_LEVELS.least_gain, POINT_LEVELS.evenness[-1][0]
 """Levels of the named causes; the search for fields uses them too."""
 SMALL_GAIN, EXCESS_SCALE = 0.1, 1.25
 """Try pairs of causes if the best single cause removes less than this fraction of the loss while the residuals exceed

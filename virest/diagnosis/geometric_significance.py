@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.calibration.physical_limits import is_depth
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import Candidate
@@ -20,8 +20,8 @@ from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.track_fit import TrackFit
 from virest.inference.tracking_bias import bias_std
 
-Array = NDArray[np.float64]
 STABILISER_CUTOFF_HZ = (0.03, 15.0)
+"""Range of an estimated cutoff; beyond it the fit has run to an end of its own range (changes.CUTOFFS_HZ)."""
 
 
 def refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, TrackFit]:

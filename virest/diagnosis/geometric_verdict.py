@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from virest.arrays import Array
 from virest.diagnosis.findings import Rival, Rung
 from virest.diagnosis.geometric_effects import GeometricEffect
 from virest.diagnosis.geometric_evidence import Evidence, Model
 from virest.image_formation.point_model import TrackTable
 from virest.inference.track_fit import TrackFit
 
-Array = NDArray[np.float64]
 FINAL_POINTS = 7000
+"""Points of the last fit, which reports the values: as many as `calibrate` uses."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,16 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask, Picture
 from virest.capture.records import Frame
-from virest.inference.edges import parallel_profiles
-from virest.inference.unsharp_mask import MIN_STEP_LEVELS, UNCLIPPED_LEVELS
+from virest.inference.edges import moved_profiles, parallel_profiles
+from virest.inference.unsharp_mask import ALONG_PX, MIN_STEP_LEVELS, UNCLIPPED_LEVELS
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
-
-REACH_PX, STEP_PX = 9.0, 0.5
 PLATEAU_PX = 5.0
 """A profile must be flat beyond this distance, where the effect of a 2 px unsharp mask has faded."""
 MAX_PLATEAU_RMS = 0.04
@@ -23,7 +19,7 @@ MAX_PLATEAU_RMS = 0.04
 MAX_OFF_PX = 1.0
 """Maximum distance between the gradient maximum and the middle of its step."""
 GRID_PX = np.arange(-6.0, 6.0 + 1e-9, 0.25)
-_ALONG_PX = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
+"""Distances from the middle of a step at which profiles are compared: PLATEAU_PX, and MAX_OFF_PX of freedom."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +40,7 @@ class IsolatedSteps:
     def __len__(self) -> int:
         return len(self.profile)
 
-    def chosen(self, rows: NDArray[np.bool_]) -> IsolatedSteps:
+    def chosen(self, rows: Mask) -> IsolatedSteps:
         """The steps at a mask."""
         return IsolatedSteps(*(getattr(self, f.name)[rows] for f in fields(self)))
 
@@ -58,7 +54,7 @@ def join_steps(parts: Sequence[IsolatedSteps]) -> IsolatedSteps:
 
 def isolated_steps(picture: Picture, frame: Frame, points_px: Array, normals: Array) -> IsolatedSteps:
     """The isolated steps among a frame's edges (n, 2), (n, 2) from `find_edges`; frame: with an exposure."""
-    profile, kept = _isolated(parallel_profiles(picture, points_px, normals, _ALONG_PX))
+    profile, kept = _isolated(parallel_profiles(picture, points_px, normals, ALONG_PX))
     times = ((time_s or 0.0) * np.ones(len(kept)) for time_s in (frame.time_s, frame.exposure_s))
     return IsolatedSteps(profile, points_px[kept], normals[kept], *times)
 
@@ -74,12 +70,12 @@ def crossing(part: Array, level: float, along_px: Array) -> Array:
     return np.asarray(along_px[after - 1] + share * (along_px[1] - along_px[0]))
 
 
-def _isolated(levels: Array) -> tuple[Array, NDArray[np.intp]]:
+def _isolated(levels: Array) -> tuple[Array, Index]:
     """(profiles (n, m) on GRID_PX of the isolated steps, normalised by step height, middle at 0; their indices)."""
     low, high = UNCLIPPED_LEVELS
     kept = np.flatnonzero((levels.min(axis=1) > low) & (levels.max(axis=1) < high))
     levels = levels[kept]
-    dark, bright = _ALONG_PX <= -PLATEAU_PX, _ALONG_PX >= PLATEAU_PX
+    dark, bright = ALONG_PX <= -PLATEAU_PX, ALONG_PX >= PLATEAU_PX
     ends = [np.median(levels[:, side], axis=1) for side in (dark, bright)]
     step = ends[1] - ends[0]
     part = (levels - ends[0][:, None]) / np.maximum(step, 1e-3)[:, None]
@@ -87,15 +83,6 @@ def _isolated(levels: Array) -> tuple[Array, NDArray[np.intp]]:
     once = (np.diff((part >= 0.5).astype(np.int8), axis=1) != 0).sum(axis=1) == 1
     flat = (step > MIN_STEP_LEVELS) & (np.maximum(*rms) < MAX_PLATEAU_RMS) & once
     part, kept = part[flat], kept[flat]
-    middle = crossing(part, 0.5, _ALONG_PX)
+    middle = crossing(part, 0.5, ALONG_PX)
     centred = np.abs(middle) < MAX_OFF_PX
-    return _moved(part[centred], middle[centred]), kept[centred]
-
-
-def _moved(part: Array, middle: Array) -> Array:
-    """Profiles resampled on GRID_PX with their middles at 0, by linear interpolation."""
-    at = (GRID_PX + middle[:, None] - _ALONG_PX[0]) / STEP_PX
-    index = np.clip(at.astype(np.intp), 0, len(_ALONG_PX) - 2)
-    share = at - index
-    rows = np.arange(len(part))[:, None]
-    return np.asarray(part[rows, index] * (1 - share) + part[rows, index + 1] * share)
+    return moved_profiles(part[centred], middle[centred], ALONG_PX, GRID_PX), kept[centred]

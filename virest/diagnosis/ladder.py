@@ -13,22 +13,11 @@ import numpy as np
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
-from virest.diagnosis.ambiguities import (
-    as_exposure,
-    exposed,
-    exposure_hypothesis,
-    merged,
-    offset_as_timestamp,
-    one_exposure,
-)
+from virest.diagnosis.ambiguities import as_exposure, exposure_hypothesis, merged, offset_as_timestamp
 from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.field.blur import blur_field
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
-from virest.diagnosis.field.brightness import (
-    instead_of_cause,
-    light_field,
-    with_light_field,
-)
+from virest.diagnosis.field.brightness import instead_of_cause, light_field, with_light_field
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
@@ -238,11 +227,12 @@ class DiagnosisSession:
             )
         if is_exposure and change is not None:
             exposure = as_exposure(self.findings, change)
-            points = replace(self.points, start=exposed(self.points.start, change.estimate))
+            points = replace(self.points, start=self.points.start.with_shutter(exposure_scale=change.estimate))
             self.geometric = points.described(points.climbed(progress), self.light.profile)
             self.findings = [exposure, *offset_as_timestamp(self.geometric, findings_of(self.geometric), exposure_s)]
-        if any(finding.name == "exposure_time" for finding in self.findings):
-            self.blur, is_exposure = one_exposure(self.blur), True
+        if any(finding.name == "exposure_time" for finding in self.findings):  # the points determined it better
+            self.blur.findings = [finding for finding in self.blur.findings if finding.name != "exposure_time"]
+            is_exposure = True
         moved = with_depth_of(self.findings, self.geometric.model.profile)
         extended = merged(moved, self.light.profile, self.blur.profile, is_exposure)
         self.curve = PictureVerdict(extended)
@@ -315,7 +305,7 @@ class DiagnosisSession:
         extended = extended.with_fields([held.rounded() for held in with_std])
         extended = with_unknowns_of(self.geometric, extended)
         # the stabiliser's lean belongs to the start of this log: a restoration that begins later must not use it
-        without_lean = replace(extended.extensions, stabilisation_lean_rad=(0.0, 0.0))
+        without_lean = extended.with_extensions(stabilisation_lean_rad=(0.0, 0.0))
         stamps = sum(NO_STAMP not in frame.skip_codes for frame in self.capture.frames)
         nominal = Nominal(
             first.nominal_rms_px, first.noise_px, self.light.photometric_rms, self.blur.blur_rms_px,
@@ -327,7 +317,7 @@ class DiagnosisSession:
             tuple(findings),
             left,
             first.nominal.profile,
-            replace(extended, extensions=without_lean),
+            without_lean,
             (*self.geometric.rungs, *(rung for stage in stages for rung in stage.rungs)),
             {"before": residuals(first, True), "after": residuals(self.geometric, False)},
             (*self.notes, *self.geometric.notes, *(note for stage in stages for note in stage.notes)),

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
 from virest.diagnosis.geometric_effects import GeometricEffect
@@ -22,7 +22,6 @@ from virest.diagnosis.geometric_evidence import Evidence, Model, fit_model
 from virest.inference.parallel import ParallelMap
 from virest.inference.track_fit import TrackFit
 
-Array = NDArray[np.float64]
 RESTART_SIGMA = 3.0
 """Repeat the model's own fit from this many standard deviations on either side."""
 Plausible = Callable[[Evidence, GeometricEffect, CameraProfile, Array], bool]

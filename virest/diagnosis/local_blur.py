@@ -19,25 +19,13 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture, Frame
 from virest.diagnosis.isolated_steps import IsolatedSteps, isolated_steps, join_steps
-from virest.diagnosis.local_blur_edges import (
-    EdgeWidths,
-    evenly_isolated,
-    isolated_edges,
-    join_edges,
-    observe_picture,
-)
-from virest.diagnosis.local_blur_model import (
-    across,
-    covariates,
-    fitted_width,
-    path_tensors,
-    predicted_ratios,
-    transfers,
-)
+from virest.diagnosis.local_blur_edges import EdgeWidths, evenly_isolated, isolated_edges, join_edges, observe_picture
+from virest.diagnosis.local_blur_model import across, fitted_width, path_tensors, predicted_ratios, transfers
 from virest.diagnosis.local_blur_spectra import (
     BANDS_PER_PX,
     MEMORY,
@@ -54,8 +42,6 @@ from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 from virest.inference.time_blocks import even_blocks
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
 
 LENS_SIGMA_PX = 0.70
@@ -79,9 +65,11 @@ PARTS = 4
 PAIR_FRAMES = 4
 """Frames from the first to the second of a pair: the camera has rotated, but the patch is still in view."""
 MIN_EDGES = 40
+"""Fewest isolated edges from which a defocus is estimated."""
 MIN_ACCEPTED = 0.004
 """Minimum fraction of the strong gradients that are isolated steps; a smooth scene has almost none."""
 MIN_RATIOS = 400
+"""Fewest measured bins from which an exposure is estimated."""
 MIN_CONTRAST = 0.06
 """Minimum rms of the predicted log ratios: frames with equal motion do not determine the exposure."""
 BLOCKS = 8
@@ -94,10 +82,8 @@ class BlurObservations:
 
     edges: EdgeWidths
     ratios: SpectrumRatios
-    candidates: int
-    """Number of strong gradients tested as edges, whether or not the image moved across them."""
     isolated: int
-    """Number of these that are isolated steps."""
+    """Number of the edges' candidates that are isolated steps, whether or not the image moved across them."""
     bits_per_px: float = inf
     """Bit rate of the movie."""
     steps: IsolatedSteps | None = None
@@ -135,23 +121,11 @@ class BlurObservations:
     @property
     def edges_determined(self) -> bool:
         """Whether the scene has enough isolated steps to distinguish a defocused image from smooth content."""
-        return len(self.edges) >= MIN_EDGES and self.isolated >= MIN_ACCEPTED * self.candidates
-
-    def covariates(self, profile: CameraProfile, trajectory: Trajectory) -> dict[str, Array]:
-        """Covariates of the residuals, one value per residual."""
-        tile, _ = np.nonzero(self.valid)
-        e, r = self.edges, self.ratios
-        stamps, exposures = (
-            np.concatenate([a, b[tile, 0, 0]]) for a, b in ((e.stamp_s, r.stamp_s), (e.exposure_s, r.exposure_s))
-        )
-        found = covariates(stamps, exposures, np.concatenate([e.points_px, r.points_px[tile, 0]]), profile, trajectory)
-        found["brightness"] = np.concatenate([e.brightness, r.brightness[tile]])
-        found["frame"] = np.concatenate([e.frame, r.frame[tile, 0]]).astype(float)
-        return found
+        return len(self.edges) >= MIN_EDGES and self.isolated >= MIN_ACCEPTED * self.edges.candidates
 
 
 def frames_to_read(capture: Capture, pairs: int = 22) -> list[int]:
-    """Movie indices for :func:`observe_blur`: pairs of frames, evenly spaced over the capture."""
+    """Movie indices for :func:`look_for_blur`: pairs of frames, evenly spaced over the capture."""
     known = {f.index for f in capture.frames if f.exposure_s and (f.skip_reason is None or f.only_startup)}
     starts = [k for k in sorted(known) if k + PAIR_FRAMES in known]
     picked = np.linspace(0, len(starts) - 1, min(pairs, len(starts))).round().astype(int)
@@ -165,12 +139,16 @@ def look_for_blur(
     trajectory: Trajectory,
     each: ParallelMap = one_by_one,
 ) -> BlurObservations:
-    """Measure the frames of :func:`frames_to_read` part by part; the result is that of one stream."""
-    wanted, curve = frames_to_read(capture), profile.response or ResponseCurve("srgb")
+    """Measure the frames of :func:`frames_to_read` part by part; the result is that of one stream.
+
+    Profile and trajectory only select the edges with little motion and the frequencies that motion leaves above the
+    noise.
+    """
+    wanted, curve = frames_to_read(capture), profile.curve
     parts = _parts(wanted)
     early = [[k for k in wanted if part[0] - PAIR_FRAMES <= k < part[0]] if part else [] for part in parts]
     calls = [(gray, [*lead, *part], len(lead), capture.frames, curve) for lead, part in zip(early, parts, strict=True)]
-    seen = each(_measured_part, calls)
+    seen = each(_measured, calls)
     edges, pairs, steps = ([one for part in seen for one in part[kind]] for kind in range(3))
     found = _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
     return replace(found, steps=join_steps(steps))
@@ -199,43 +177,24 @@ def _steps_of_part(
     ]
 
 
-def _measured_part(
+def _measured(
     gray: Callable[[Sequence[int]], Stream], wanted: list[int], lead: int, frames: Sequence[Frame], curve: ResponseCurve
 ) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps]]:
-    return _measured(gray(wanted), frames, curve, EdgeSettings(), frozenset(wanted[:lead]))
+    """Edges, spectrum ratios and steps of frames in ascending order; the first ``lead`` only serve as first of a pair.
 
-
-def observe_blur(
-    pictures: Stream,
-    capture: Capture,
-    profile: CameraProfile,
-    trajectory: Trajectory,
-    settings: EdgeSettings | None = None,
-) -> BlurObservations:
-    """Measure a stream of (movie index, grey (h, w)), in ascending order, of the frames of :func:`frames_to_read`.
-
-    At most PAIR_FRAMES + 1 frames are in memory.  Profile and trajectory only select the edges with little motion and
-    the frequencies that motion leaves above the noise.
+    At most PAIR_FRAMES + 1 frames are in memory.
     """
-    curve = profile.response or ResponseCurve("srgb")
-    edges, pairs, _ = _measured(pictures, capture.frames, curve, settings or EdgeSettings(), frozenset())
-    return _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
-
-
-def _measured(
-    pictures: Stream, frames: Sequence[Frame], curve: ResponseCurve, settings: EdgeSettings, only_paired: frozenset[int]
-) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps]]:
-    """Edges, spectrum ratios and steps of all frames; frames in ``only_paired`` only serve as the first of a pair."""
+    only_paired = frozenset(wanted[:lead])
     edges: list[EdgeWidths] = []
     steps: list[IsolatedSteps] = []
     pairs: list[SpectrumRatios] = []
     kept: dict[int, SeenFrame] = {}
-    for index, picture in pictures:
+    for index, picture in gray(wanted):
         if picture is None or not frames[index].exposure_s:
             continue
         if index not in only_paired:
-            found = find_edges(picture, settings)
-            edges.append(observe_picture(picture, frames[index], curve, settings, found))
+            found = find_edges(picture, EdgeSettings())
+            edges.append(observe_picture(picture, frames[index], curve, *found))
             steps.append(isolated_steps(picture, frames[index], *found))
         kept[index] = SeenFrame(picture, _recent(frames, index))
         if index - PAIR_FRAMES in kept and index not in only_paired:
@@ -260,7 +219,7 @@ def _chosen(
     through = transfers(ratios, profile, trajectory)[:, :, 0].min(axis=1)
     ratio = np.where(through > MIN_TRANSFER, ratios.log_ratio, np.nan)
     isolated = len(isolated_edges(edges))
-    return BlurObservations(still, replace(ratios, log_ratio=ratio), edges.candidates, isolated, bits_per_px)
+    return BlurObservations(still, replace(ratios, log_ratio=ratio), isolated, bits_per_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,7 +287,7 @@ def _motion_px(edges: EdgeWidths, profile: CameraProfile, trajectory: Trajectory
     return np.sqrt(across(tensors, edges.normal))
 
 
-def time_blocks(time_s: Array, count: int = BLOCKS) -> NDArray[np.intp]:
+def time_blocks(time_s: Array, count: int = BLOCKS) -> Index:
     """Block (n,) of each residual; each block has the same number of distinct timestamps."""
     stamps = np.unique(time_s)
     return even_blocks(np.searchsorted(stamps, time_s), len(stamps), count)

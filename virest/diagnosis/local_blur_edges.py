@@ -24,12 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from virest.arrays import Array, Index, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
-from virest.inference.edges import TANGENT_PX, EdgeSettings, find_edges, sampled
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
+from virest.inference.edges import TANGENT_PX, sampled
+from virest.inference.unsharp_mask import MIN_STEP_LEVELS
 
 STEP_PX = 0.5
 """Sample spacing of a profile."""
@@ -42,6 +41,9 @@ WIDTH_MARGIN = 1.2
 Widths in one capture scatter by 4 to 14 % (16 simulated captures of four scenes, defocus of 1.2 to 3.5 px)."""
 MAX_SOFTNESS_RATIO = 2.0
 """Other frames of a capture may be up to this many times as soft, so reaches are fitted up to that width."""
+MAX_MISFIT = 0.02
+"""Largest rms of a profile about its fitted step, relative to the step's height; half or twice moves a simulated
+defocus by 0.7 and 0.3 σ."""
 LEAST_WIDTH_PX = 0.05
 _FIT_STEPS, _FURTHER_STEPS = 12, 3
 """Iterations of the fit from a guess, and from the fit of the same step over a shorter reach."""
@@ -54,7 +56,7 @@ class EdgeWidths:
     Before :func:`isolated_edges`, one row for each edge and reach that holds it; afterwards, one row per isolated edge.
     """
 
-    frame: NDArray[np.intp]
+    frame: Index
     """(n,) movie index."""
     stamp_s: Array
     """(n,) the frame's timestamp, camera clock."""
@@ -64,7 +66,7 @@ class EdgeWidths:
     """(n, 2) middle of the edge."""
     normal: Array
     """(n, 2) unit normal, from dark to bright."""
-    number: NDArray[np.intp]
+    number: Index
     """(n,) index of the edge in its frame."""
     reach_px: Array
     """(n,) half length of the profile."""
@@ -89,24 +91,18 @@ class EdgeWidths:
 def join_edges(parts: Sequence[EdgeWidths]) -> EdgeWidths:
     """Concatenate the rows of several frames."""
     if not parts:
-        return _no_edges()
+        none, points, number = np.zeros(0), np.zeros((0, 2)), np.zeros(0, np.intp)
+        return EdgeWidths(number, none, none, points, points, number, none, none, none, none)
     names = [f.name for f in fields(EdgeWidths) if f.name != "candidates"]
     rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return EdgeWidths(**rows, candidates=sum(part.candidates for part in parts))
 
 
-def observe_picture(
-    picture: Picture,
-    frame: Frame,
-    curve: ResponseCurve,
-    settings: EdgeSettings,
-    found: tuple[Array, Array] | None = None,
-) -> EdgeWidths:
-    """Widths of the edges in one frame, over every reach; found: the result of :func:`find_edges`, if available."""
-    points, normals = find_edges(picture, settings) if found is None else found
+def observe_picture(picture: Picture, frame: Frame, curve: ResponseCurve, points: Array, normals: Array) -> EdgeWidths:
+    """Widths of the edges in one frame, over every reach; points, normals: of :func:`find_edges`."""
     grey = _profiles(picture.astype(np.float32), points, normals)
     light = _profiles(curve.linear_table()[picture], points, normals)
-    fit = measure_widths(light, settings.max_misfit)
+    fit = measure_widths(light)
     step_levels, brightest, brightness = _levels_of(grey[fit.row], fit.reach_px)
     clipped = brightest > float(np.flatnonzero(~curve.clipped_table(1.5)).max(initial=0))
     full = np.ones(len(fit.row))
@@ -118,7 +114,7 @@ def observe_picture(
         normal=normals[fit.row],
         number=fit.row,
         reach_px=fit.reach_px,
-        width_px=np.where((step_levels > settings.min_step_levels) & ~clipped, fit.width_px, 0.0),
+        width_px=np.where((step_levels > MIN_STEP_LEVELS) & ~clipped, fit.width_px, 0.0),
         step_levels=step_levels,
         brightness=brightness / 255.0,
         candidates=len(points),
@@ -192,14 +188,14 @@ def _levels_of(grey: Array, reach_px: Array) -> tuple[Array, Array, Array]:
 class WidthFit:
     """Steps fitted to profiles over every reach that holds them; width 0: the profile is not a step."""
 
-    row: NDArray[np.intp]
+    row: Index
     """(n,) index of the profile."""
     width_px: Array
     centre_px: Array
     reach_px: Array
 
 
-def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
+def measure_widths(profiles: Array) -> WidthFit:
     """Fit profiles (n, m) of a frame over all reaches that may be shared; keep those that hold ISOLATION widths.
 
     The reaches follow from the profiles alone, not from a predicted blur, so no model chooses its own evidence.
@@ -223,7 +219,7 @@ def measure_widths(profiles: Array, max_misfit: float) -> WidthFit:
             & (ISOLATION * width + 1.0 <= reach - np.abs(centre))
             & (np.abs(centre) < 0.5 * reach)
         )
-        good = (misfit < max_misfit) & (width > LEAST_WIDTH_PX)
+        good = (misfit < MAX_MISFIT) & (width > LEAST_WIDTH_PX)
         ended |= ends & good
         parts.append((*np.nonzero(ends), np.where(good, width, 0.0)[ends], centre[ends], np.full(ends.sum(), reach)))
     return WidthFit(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -263,19 +259,3 @@ def _step_model(u: Array, profiles: Array, centre: Array, width: Array) -> tuple
     residual = profiles - mean_profile - b[:, None] * (shape - mean_shape)
     bell = np.sqrt(2 / np.pi) * np.exp(-0.5 * z**2) * (b / width)[:, None]
     return b, np.stack([np.ones_like(shape), shape, -bell, -bell * z], axis=1), residual
-
-
-def _no_edges() -> EdgeWidths:
-    empty = np.zeros(0)
-    return EdgeWidths(
-        np.zeros(0, np.intp),
-        empty,
-        empty,
-        np.zeros((0, 2)),
-        np.zeros((0, 2)),
-        np.zeros(0, np.intp),
-        empty,
-        empty,
-        empty,
-        empty,
-    )

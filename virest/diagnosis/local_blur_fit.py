@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
+from virest.calibration.physical_limits import SCALE_OF_EXPOSURE
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import BLUR, HeldOutGain
 from virest.diagnosis.local_blur import (
@@ -30,10 +30,6 @@ from virest.inference.robust import robust_std
 from virest.inference.time_blocks import halves
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-_EXPOSURE_SCALES = (0.05, 20.0)
 SHIFT_STD_S = 0.004
 """Standard deviation of the row times after the geometric fit; their shift is a nuisance parameter of every fit."""
 PATH_STD = 0.03
@@ -48,32 +44,13 @@ _NUISANCE = np.array([LENS_SIGMA_PX, 0.0])
 _NUISANCE_STD = np.array([LENS_STD_PX, SHIFT_STD_S])
 _NUISANCE_LOW = np.array([0.35, -0.03])
 _NUISANCE_HIGH = np.array([0.95, 0.03])
+"""Width of a sharp edge (px) and shift of the rows' times (s): mean, standard deviation, and bounds of the fit."""
 _LOW, _HIGH, _STEP = 0.02, 50.0, 0.02
 """Bounds of every effect's value, and its finite-difference step."""
-_NUISANCE_STEP = np.array([0.02, 5e-4])
-_DAMPING_STEP, _LEAST_STD_PX = 0.02, 1e-3
-
-
-class BlurEffect(Protocol):
-    """One cause that local blur can show."""
-
-    name: str
-    parameters: tuple[str, ...]
-
-    def starts(self, observations: BlurObservations, profile: CameraProfile) -> list[Array]:
-        """Starting values of a fit."""
-
-    def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """The profile with the effect's parameters set."""
-
-    def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
-        """Whether the capture determines the effect at all."""
-
-    def possible(self, values: Array) -> bool:
-        """Whether fitted values are an estimate rather than a bound of the fit."""
-
-    def shows_in(self, observations: BlurObservations) -> Mask:
-        """Mask of the residuals that determine the effect."""
+_NUISANCE_STEP, _DAMPING_STEP = np.array([0.02, 5e-4]), 0.02
+"""Finite-difference steps of the nuisances and of the damping."""
+_LEAST_STD_PX = 1e-3
+"""Keeps the scale of residuals without noise above 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +66,7 @@ class ExposureTime:
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set shutter.exposure_scale."""
-        scale = float(np.clip(values[0], *_EXPOSURE_SCALES))
-        return replace(profile, shutter=replace(profile.shutter, exposure_scale=scale))
+        return profile.with_shutter(exposure_scale=float(np.clip(values[0], *SCALE_OF_EXPOSURE)))
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
         """Whether there are enough tiles in frames with unequal motion."""
@@ -102,7 +78,7 @@ class ExposureTime:
 
     def possible(self, values: Array) -> bool:
         """Whether the scale is within its bounds; at a bound, something else is wrong."""
-        low, high = _EXPOSURE_SCALES
+        low, high = SCALE_OF_EXPOSURE
         return low < float(values[0]) < high
 
     def shows_in(self, observations: BlurObservations) -> Mask:
@@ -124,8 +100,7 @@ class Defocus:
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set extensions.defocus_sigma_px."""
-        sigma = float(np.clip(values[0], 0.0, 50.0))
-        return replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=sigma))
+        return profile.with_extensions(defocus_sigma_px=float(np.clip(values[0], 0.0, 50.0)))
 
     def determined(self, observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> bool:
         """Whether there are enough isolated steps."""
@@ -138,6 +113,10 @@ class Defocus:
     def shows_in(self, observations: BlurObservations) -> Mask:
         """The edges: ratios of spectra between frames lack a blur that all frames share."""
         return observations.is_edge
+
+
+BlurEffect = ExposureTime | Defocus
+"""One cause that local blur can show."""
 
 
 @dataclass(frozen=True, slots=True)

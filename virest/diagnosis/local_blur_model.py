@@ -9,24 +9,23 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.local_blur_edges import STEP_PX, fit_steps
 from virest.diagnosis.local_blur_spectra import MEMORY, SpectrumRatios, spectral_weights
-from virest.image_formation.kernels import angle_and_length, blur_chords
-from virest.image_formation.row_clock import ROW_MIDDLE, ROW_START, RowClock
-from virest.image_formation.row_motion import row_motion
+from virest.image_formation.row_clock import ROW_MIDDLE
 from virest.image_formation.turning_camera import turning_camera
 from virest.image_formation.warp import seen_by_rows
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 _NODES = 4
+"""Nodes along each side for the six terms of a quadratic in position."""
 _INSTANTS = 5
 """Gauss-Legendre nodes of an exposure: exact for paths that are fourth-order polynomials in time."""
 _RATIOS = np.linspace(0.0, 6.0, 25)
+"""Widths of a path over that of the Gaussian at which the ratio is tabulated."""
 LEAST_ANGLE = 1e-3
 """Below it sin q / q is 1 to single precision."""
 
@@ -111,34 +110,6 @@ def predicted_ratios(ratios: SpectrumRatios, profile: CameraProfile, trajectory:
     """log |K1|²/|K2|² of the frames themselves and of those before them: (n, b, MEMORY)."""
     logs = np.log(transfers(ratios, profile, trajectory))
     return np.moveaxis(logs[:, 0] - logs[:, 1], 1, 2)
-
-
-def covariates(
-    stamp_s: Array, exposure_s: Array, points_px: Array, profile: CameraProfile, trajectory: Trajectory
-) -> dict[str, Array]:
-    """Covariates of the residuals: row, time, radius, rate, exposure, path length and angle."""
-    width, height = profile.width, profile.height
-    clock, chords = RowClock(profile), np.empty((len(stamp_s), 2))
-    for rows in _by_frame(stamp_s):
-        motion = row_motion(trajectory, profile, float(stamp_s[rows[0]]), float(exposure_s[rows[0]]))
-        chords[rows] = blur_chords(motion, points_px[rows])
-    angle, length = angle_and_length(chords)
-    start_s, middle_s = (clock.seen_s(points_px, stamp_s, exposure_s, share) for share in (ROW_START, ROW_MIDDLE))
-    off_centre = np.linalg.norm(points_px - np.array([(width - 1) / 2, (height - 1) / 2]), axis=-1)
-    return {
-        "row": clock.readout_fraction(points_px),
-        "time": start_s,
-        "radius": off_centre / (0.5 * np.hypot(width, height)),
-        "rate": np.linalg.norm(trajectory.rate_rad_s(middle_s), axis=-1),
-        "exposure": exposure_s,
-        "path_length_px": length,
-        "path_angle_rad": angle,
-    }
-
-
-def _by_frame(stamp_s: Array) -> list[NDArray[np.intp]]:
-    order = np.argsort(stamp_s, kind="stable")
-    return [rows for rows in np.split(order, np.flatnonzero(np.diff(stamp_s[order])) + 1) if len(rows)]
 
 
 @lru_cache(maxsize=4)

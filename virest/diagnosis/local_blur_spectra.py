@@ -15,20 +15,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Frame
 from virest.restoration.statistics.tile_power import white_noise
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
-
 SIDE_PX = 64
+"""Side of a tile: 64 px resolve the lowest ring, 0.055 cycles per pixel, by 3.5 frequencies."""
 MEMORY = 3
 """Number of frames whose blur a decoded frame may show: its own and, through H.264's prediction, those before it."""
 SPACING_PX = 48
+"""Of the tiles, which overlap by a quarter."""
 BANDS_PER_PX = (0.055, 0.08, 0.11)
 """Bounds of the frequency rings, cycles per pixel: above the window's own width, below what H.264 quantises away."""
 SECTORS = 6
+"""Directions in which a ring is divided, 30° each."""
 SCENE_POWER = 2.5
 """Exponent with which a scene's power falls with frequency: 2 for natural texture, 3 for edges."""
 MAX_BACK_PX = 0.3
@@ -43,8 +44,6 @@ SIGNAL_TO_FLOOR = 8.0
 class SpectrumRatios:
     """One row per tile seen in two frames; (…, 2) holds the first and the second frame."""
 
-    frame: NDArray[np.intp]
-    """(n, 2) movie indices."""
     stamp_s: Array
     """(n, 2, MEMORY) camera clock, of the frame itself and of those before it, newest first."""
     exposure_s: Array
@@ -53,19 +52,13 @@ class SpectrumRatios:
     """(n, 2, 2) centre of the tile."""
     log_ratio: Array
     """(n, b) log of first over second power, in each ring and sector of :func:`bins`; NaN where noise dominates."""
-    brightness: Array
-    """(n,) mean grey, 0 to 1."""
 
     def __len__(self) -> int:
-        return len(self.frame)
-
-    def select(self, keep: NDArray[np.bool_]) -> SpectrumRatios:
-        """The rows at a mask."""
-        return SpectrumRatios(*(getattr(self, f.name)[keep] for f in fields(self)))
+        return len(self.points_px)
 
 
 @lru_cache(maxsize=1)
-def bins() -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+def bins() -> tuple[Array, Index, Index]:
     """(frequencies (m, 2) inside the rings, cycles per pixel; their indices in the flat spectrum; bins (m,))."""
     fx, fy = np.meshgrid(np.fft.rfftfreq(SIDE_PX), np.fft.fftfreq(SIDE_PX))
     radius = np.hypot(fx, fy)
@@ -110,7 +103,7 @@ def spectral_weights() -> tuple[Array, Array]:
     return unique / SIDE_PX, weights / weights.sum(axis=0)
 
 
-def ring_of_bin() -> NDArray[np.intp]:
+def ring_of_bin() -> Index:
     """(b,) ring of each bin."""
     return np.arange(bin_count()) // SECTORS
 
@@ -141,12 +134,10 @@ def observe_pair(first: SeenFrame, second: SeenFrame, curve: ResponseCurve) -> S
     both = np.ones((int(keep.sum()), 1, 1))
     logs = (first.recent, second.recent)
     return SpectrumRatios(
-        frame=np.array([[recent[0].index for recent in logs]], np.intp).repeat(len(both), axis=0),
         stamp_s=both * [[f.time_s for f in recent] for recent in logs],
         exposure_s=both * [[f.exposure_s or 0.0 for f in recent] for recent in logs],
         points_px=np.stack([start, moved], 1)[keep],
         log_ratio=ratio[keep],
-        brightness=grey_1[keep] / 255.0,
     )
 
 
@@ -154,9 +145,8 @@ def join_ratios(parts: Iterable[SpectrumRatios]) -> SpectrumRatios:
     """Concatenate the rows of several pairs."""
     parts = list(parts)
     if not parts:
-        none = np.zeros((0, 2), np.intp)
         logs = np.zeros((0, 2, MEMORY))
-        return SpectrumRatios(none, logs, logs, np.zeros((0, 2, 2)), np.zeros((0, bin_count())), np.zeros(0))
+        return SpectrumRatios(logs, logs, np.zeros((0, 2, 2)), np.zeros((0, bin_count())))
     return SpectrumRatios(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SpectrumRatios)))
 
 
@@ -181,8 +171,8 @@ def _tracked_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
 
 
 def _tile_powers(
-    picture: Picture, middles: Array, table: NDArray[np.float32], clipped: NDArray[np.bool_]
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+    picture: Picture, middles: Array, table: NDArray[np.float32], clipped: Mask
+) -> tuple[Array, Array, Mask]:
     """(power (n, b) in linear light, mean grey (n,), mask of the tiles with clipped light)."""
     reach = SIDE_PX // 2
     cuts = [picture[int(y) - reach : int(y) + reach, int(x) - reach : int(x) + reach] for x, y in middles]

@@ -19,20 +19,17 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.image_formation.light import LEAST_LIGHT, flicker, light_maps, vignetting_at_radius
 from virest.image_formation.row_clock import ROW_MIDDLE, ROW_START, RowClock
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-
 _LOG_LIGHT = np.arange(-9.5, 0.75, 0.002)
 """Grid of the tabulated curve, natural logarithm of light."""
 _LIGHT_STEPS = 3
+"""Steps of a patch's light; 2 or 6 give the same values to 0.001 σ (simulated vignetting and flicker)."""
 _LEAST_SLOPE = 0.02
 """Grey levels per unit of log light below which an observation does not determine its light."""
 
@@ -41,9 +38,9 @@ _LEAST_SLOPE = 0.02
 class PhotometricObservations:
     """Mean grey of patches, one entry for each patch, channel and frame that shows it; all arrays (n,)."""
 
-    patch: Indices
+    patch: Index
     """Patch and channel: 3 · place + channel.  Entries with the same number share one unknown light."""
-    frame: Indices
+    frame: Index
     """Movie index."""
     stamp_s: Array
     """The frame's timestamp, camera clock from stamp_0."""
@@ -76,12 +73,12 @@ class PhotometricObservations:
         return len(self.grey)
 
     @property
-    def place(self) -> Indices:
+    def place(self) -> Index:
         """(n,) number of the patch without its channel."""
         return self.patch // 3
 
     @property
-    def frames(self) -> Indices:
+    def frames(self) -> Index:
         """(k,) movie indices that occur, ascending."""
         return np.unique(self.frame)
 
@@ -98,16 +95,6 @@ class PhotometricObservations:
     def with_memory(self, memory: float) -> PhotometricObservations:
         """The same with another encoder memory."""
         return replace(self, memory=memory)
-
-    def covariates(self, profile: CameraProfile) -> dict[str, Array]:
-        """Covariates of the residuals."""
-        return {
-            "row": self.row_fraction,
-            "time": self.row_time_s(profile),
-            "radius": self.radius,
-            "brightness": self.grey,
-            "exposure": self.exposure_s,
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +141,7 @@ def predict(observations: PhotometricObservations, profile: CameraProfile, weigh
     weight: (n,) weights in that fit; 1 / noise² unless given.
     """
     weight = 1.0 / observations.noise**2 if weight is None else weight
-    tables = _tables(profile.response or ResponseCurve("srgb"))
+    tables = _tables(profile.curve)
     factor, kept = log_light_factor(observations, profile), _kept(observations)
     patch = observations.patch
     seen = np.interp(observations.grey, tables[0], _LOG_LIGHT) - factor
@@ -220,7 +207,7 @@ def normalised_rms(observations: PhotometricObservations, profile: CameraProfile
     return float(np.sqrt(np.sum(left**2) / free.sum())), float(np.sqrt(np.mean(observations.noise**2)))
 
 
-def _patch_sum(patch: Indices, values: Array) -> Array:
+def _patch_sum(patch: Index, values: Array) -> Array:
     total = np.asarray(np.bincount(patch, values), np.float64)
     return np.maximum(total, 1e-12) if np.all(values >= 0) else total
 

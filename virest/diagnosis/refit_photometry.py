@@ -18,10 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.findings import Finding
-from virest.diagnosis.photometry import Array, PhotometricObservations
+from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.photometry_effects import BlackLevel, PhotometricEffect, ResponseGamma
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, pulls, significance
 from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, frames_of, light_varies, sentence_of, values_of
@@ -31,7 +32,9 @@ STATED_STD = np.array([0.15, 0.02])
 UNKNOWN_STD = np.array([0.3, 0.04])
 """The same for an unknown curve, for which the default is used."""
 _STEP = 1e-3
+"""Finite-difference step of the logarithms of gamma and exposure, and of the black level."""
 _GAMMA, _BLACK = 0, 1
+"""Places in these vectors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,11 +141,10 @@ def _added_covariance(
 
 def _shifted(profile: CameraProfile, change: Array) -> CameraProfile:
     """The profile with (log gamma, black level, log exposure scale) changed."""
-    curve, shutter = profile.response or ResponseCurve("srgb"), profile.shutter
-    gamma, black = curve.extra_gamma * float(np.exp(change[0])), curve.black_level + float(change[1])
-    scale = shutter.exposure_scale * float(np.exp(change[2]))
-    curve = replace(curve, extra_gamma=gamma, black_level=black)
-    return replace(profile, response=curve, shutter=replace(shutter, exposure_scale=scale))
+    gamma = profile.curve.extra_gamma * float(np.exp(change[0]))
+    black_level = profile.curve.black_level + float(change[1])
+    scale = profile.shutter.exposure_scale * float(np.exp(change[2]))
+    return profile.with_curve(extra_gamma=gamma, black_level=black_level).with_shutter(exposure_scale=scale)
 
 
 def _exposure_variance(causes: Sequence[Finding]) -> float:
@@ -163,7 +165,7 @@ def _curve_by_brightness(observations: PhotometricObservations, fitted: Photomet
     if not free:
         return spread
     beside = fit_photometry(observations, fitted.profile, [*fitted.effects, *(curves[k] for k in free)])
-    now = fitted.profile.response or ResponseCurve("srgb")
+    now = fitted.profile.curve
     inner = slice(len(fitted.values), None)
     estimate, covariance = beside.values[inner].copy(), beside.covariance[inner, inner].copy()
     if _GAMMA in free:
@@ -180,7 +182,7 @@ def _curve_by_brightness(observations: PhotometricObservations, fitted: Photomet
 def _curve_by_mixing(curve: PictureVerdict, prior: Array) -> CurveUncertainty:
     """Uncertainty after light mixing: of the reported change, else of an unreported gamma, else the prior's."""
     spread = np.zeros((3, 3))
-    now = curve.profile.response or ResponseCurve("srgb")
+    now = curve.profile.curve
     named = {finding.name: finding for finding in curve.findings}
     if "response_curve" in named:
         change = named["response_curve"].parameters["gamma"]
@@ -202,7 +204,7 @@ def _rival(named: Finding, rival: str, curve: PictureVerdict) -> ResponseCurve:
     """The curve with its rival's change instead of the reported one."""
     fields = {"response_curve": "extra_gamma", "black_level": "black_level"}
     (change,) = named.parameters.values()
-    now = curve.profile.response or ResponseCurve("srgb")
+    now = curve.profile.curve
     return replace(now, **{fields[named.name]: change.nominal, fields[rival]: curve.mixed[rival][0].value})
 
 

@@ -5,29 +5,32 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.diagnosis import photometry, picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.structure import Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
-from virest.image_formation.point_model import seen_s
+from virest.image_formation.point_model import TrackTable, seen_s
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.robust import cauchy_weight, robust_std
+from virest.inference.track_fit import TrackFit
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
 """Structure above this size, and above this fraction of the noise, has a cause."""
 STRUCTURE_P = 1e-4
+"""p value of a structure, and of excess noise: the eight tests of points together stay below FALSE_ALARM."""
 TRACKING_BIAS_PX = 0.02
+"""Mean residual that a tracker's own bias leaves in a bin."""
 SCALE_EXCESS = 1.25
 """Residuals above this many times their noise, measured without the model, and STRUCTURE_PX beyond it are not all
 noise."""
-LEAST_IN_PAIR = 8
-STRAY_DISTANCE = 6.0
+LEAST_IN_PAIR, STRAY_DISTANCE = 8, 6.0
+"""Pairs with at most this number of points are not tested; a point that far off, in standard deviations, is stray: of
+normal errors, 1 in 7e7 is."""
 HALF_WEIGHT_SIGMA = 40.0
 """Brightness residual with half weight, in robust σ: a band of the sensor is evidence, a passer-by is not."""
 PHOTOMETRIC_STRUCTURE = 1.5
@@ -50,23 +53,12 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     explains this, it belongs to the scene and is not an error of the model.
     """
     fitted, table = geometric.fit, geometric.table
-    profile, lens = fitted.profile, fitted.profile.intrinsics
-    assert lens is not None
-    noise = geometric.noise_px
-    from_centre = table.second_px - np.array([lens.cx_px, lens.cy_px])
-    radius = np.linalg.norm(from_centre, axis=-1)
-    outwards = from_centre / np.maximum(radius, 1.0)[:, None]
+    noise, covariates = geometric.noise_px, _covariates(fitted, table)
+    outwards = _from_centre_px(fitted, table) / np.maximum(covariates["radius"], 1.0)[:, None]
     left_px = fitted.across_relief_px()
     radial = (left_px * outwards).sum(axis=-1)
     difference = np.concatenate([left_px, radial[:, None]], axis=-1)
-    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
-    covariates = {
-        "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
-        "radius": radius,
-        "x": table.second_px[:, 0],
-        "y": table.second_px[:, 1],
-        "rate": np.linalg.norm(fitted.integrated.trajectory.rate_rad_s(second_s), axis=-1),
-    }
+    del covariates["time"]
     found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
     found.append(_along_time(left_px, fitted.weight, table.pair))
     strongest = max(found, key=lambda s: s.size)
@@ -90,7 +82,28 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, False)
 
 
-def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> tuple[float, float]:
+def _from_centre_px(fitted: TrackFit, table: TrackTable) -> Array:
+    """(n, 2) from the principal point to the second points."""
+    lens = fitted.profile.intrinsics
+    assert lens is not None
+    return table.second_px - np.array([lens.cx_px, lens.cy_px])
+
+
+def _covariates(fitted: TrackFit, table: TrackTable) -> dict[str, Array]:
+    """What residuals of the second points may depend on."""
+    profile, second_px = fitted.profile, table.second_px
+    second_s = seen_s(profile, second_px, table.second_stamp_s, table.second_exposure_s)
+    return {
+        "row": profile.shutter.readout_fraction(second_px, profile.width, profile.height),
+        "time": second_s,
+        "radius": np.linalg.norm(_from_centre_px(fitted, table), axis=-1),
+        "x": second_px[:, 0],
+        "y": second_px[:, 1],
+        "rate": np.linalg.norm(fitted.integrated.trajectory.rate_rad_s(second_s), axis=-1),
+    }
+
+
+def _more_than_noise(distance: Array, pair: Index, noise: float) -> tuple[float, float]:
     """p values of the hypotheses that whitened distances are noise alone, and that the stray points are chance.
 
     One-sided t tests over the pairs: of their capped mean squares against 2 (SCALE_EXCESS noise)², and of their stray
@@ -105,7 +118,7 @@ def _more_than_noise(distance: Array, pair: NDArray[np.intp], noise: float) -> t
     return first, second
 
 
-def _along_time(difference: Array, weight: Array, pair: NDArray[np.intp]) -> Structure:
+def _along_time(difference: Array, weight: Array, pair: Index) -> Structure:
     """Structure over time: scatter of the pairs' mean residuals in excess of what the scatter of their points gives."""
     total = np.maximum(np.bincount(pair, weight), 1e-9)
     excess, chi2, freedom = 0.0, 0.0, 0
@@ -125,10 +138,8 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
     assert observations is not None
     left = photometry.residuals(observations, photometric.profile)
     covariates = {
-        name: values
-        for name, values in observations.covariates(photometric.profile).items()
-        if name in ("row", "radius", "brightness")
-    }
+        "row": observations.row_fraction, "radius": observations.radius, "brightness": observations.grey,
+    }  # fmt: skip
     weight = cauchy_weight(left**2, HALF_WEIGHT_SIGMA * max(robust_std(left), 1.0))
     found = structures(left[:, None], weight, covariates, observations.frame.astype(np.intp), 0.5)
     strongest = max(found, key=lambda s: s.size)
@@ -142,20 +153,13 @@ def residuals(geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:
     """Point residuals (px) with their covariates, before or after the causes, for figures."""
     fitted = geometric.nominal_fit if nominal else geometric.fit
     table = geometric.nominal_table if nominal else geometric.table
-    profile, lens = fitted.profile, fitted.profile.intrinsics
-    assert lens is not None
-    centre = np.array([lens.cx_px, lens.cy_px])
-    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
-    rate = np.linalg.norm(fitted.integrated.trajectory.rate_rad_s(second_s), axis=-1)
+    covariates = _covariates(fitted, table)
     return {
         "x_px": fitted.difference_px[:, 0],
         "y_px": fitted.difference_px[:, 1],
-        "row": profile.shutter.readout_fraction(table.second_px, profile.width, profile.height),
-        "time": second_s,
-        "radius": np.linalg.norm(table.second_px - centre, axis=-1),
-        "rate": rate,
-        "column": table.second_px[:, 0],
-        "line": table.second_px[:, 1],
+        **{name: covariates[name] for name in ("row", "time", "radius", "rate")},
+        "column": covariates["x"],
+        "line": covariates["y"],
         "pair": table.pair.astype(float),
         "weight": fitted.weight,
         "distance": fitted.distance,

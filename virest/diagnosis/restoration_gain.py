@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask, Picture
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.imu import ImuSamples
@@ -46,20 +47,21 @@ from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.frame import RestoredFrame
 from virest.restoration.settings import PRESETS, RestorationSettings
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 Rectangle = tuple[int, int, int, int]
 Reader = Callable[[Sequence[int]], Iterator[tuple[int, Picture | None]]]
 
 PAIRS = 4
+"""Pairs of frames that are restored: the cost is that of 16 frames."""
 KEPT_BACK = 0.1
 """Maximum fraction of the frames that is kept back from fits."""
 MIN_TRACKS = 16
 """Minimum number of points for aligning two pictures."""
 HOMOGRAPHY_PX = 2.0
+"""Points within this of the homography determine it."""
 EDGE_PX = 4
 """Margin excluded along the border of the valid area: half the reach of the gradient and of the interpolation."""
 PATCH_PX = 9
+"""Side of the square over which light is averaged at a point."""
 LIGHT_RANGE = (0.02, 0.9)
 """As fractions of the curve's full range; darker light is noise, brighter light may be clipped."""
 
@@ -332,7 +334,7 @@ def _tracked(
     return _Pair(pictures, valid_px, tracks if len(tracks) >= MIN_TRACKS else None)
 
 
-def _within(points_px: Array, rectangle: Rectangle) -> NDArray[np.bool_]:
+def _within(points_px: Array, rectangle: Rectangle) -> Mask:
     x0, y0, x1, y1 = rectangle
     low, high = np.array([x0, y0]) + EDGE_PX, np.array([x1, y1]) - 1 - EDGE_PX
     return np.all((points_px >= low) & (points_px <= high), axis=1)
@@ -350,7 +352,7 @@ def _overlap(rectangles: NDArray[np.int64]) -> Rectangle:
     return x0, y0, x1, y1
 
 
-def _inside(rectangle: Rectangle, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _inside(rectangle: Rectangle, shape: tuple[int, ...]) -> Picture:
     x0, y0, x1, y1 = rectangle
     mask = np.zeros(shape[:2], np.uint8)
     mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = 1
@@ -381,7 +383,7 @@ def _light_ratios(profile: CameraProfile, pair: _Pair) -> Array:
     """Log ratio of the light at tracked points minus the pair's median, since exposure may change between frames."""
     if pair.tracks is None:
         return np.empty(0)
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     points = pair.tracks.points_first_px, pair.tracks.points_second_px
     a, b = (_patch_light(picture, curve, where) for picture, where in zip(pair.pictures, points, strict=True))
     low, high = (part * float(curve.linear_table().max()) for part in LIGHT_RANGE)

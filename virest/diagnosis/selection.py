@@ -2,7 +2,7 @@
 
 A cause's value must be significant, large enough to matter, and must predict data that it was not fitted to.
 
-False alarms: any cause of the catalogue may be named by chance, so each value is tested at MAX_P (Bonferroni): those of
+False alarms: any effect of the table may be named by chance, so each value is tested at MAX_P (Bonferroni): those of
 points, brightness, blur and edges add up to at most FALSE_ALARM.  Each of the three causes without a value
 (WORD_LEVELS) adds FALSE_ALARM, and constant exposure × ISO adds twice the level of MIXING_LEVELS.  The held-out gains
 that are also required only lower this.
@@ -14,8 +14,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from virest.diagnosis.catalogue import FALSE_ALARM, MAX_P
 from virest.diagnosis.findings import HeldOutGain
+from virest.effects.table import EFFECTS
+
+FALSE_ALARM = 1e-3
+"""Probability that any cause is reported for a capture without errors."""
+MAX_P = FALSE_ALARM / len(EFFECTS)
+"""p value below which a cause is significant: Bonferroni correction over all causes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.inference.chance import chi2_tail, normal_deviate, student_tail
 
-Array = NDArray[np.float64]
 BINS = 10
+"""Bins of a covariate, with equally many residuals."""
 LEAST_IN_CELL = 4
 """Minimum number of residuals for a mean of one bin in one time block."""
 
@@ -31,7 +31,7 @@ class Structure:
 
 
 def structures(
-    values: Array, weight: Array, covariates: dict[str, Array], block: NDArray[np.intp], floor: float
+    values: Array, weight: Array, covariates: dict[str, Array], block: Index, floor: float
 ) -> list[Structure]:
     """Test each covariate (n,), none of them time, which the blocks divide; strongest structure first.
 
@@ -42,9 +42,7 @@ def structures(
     return sorted(found, key=lambda s: -s.size)
 
 
-def _along(
-    name: str, values: Array, weight: Array, covariate: Array, block: NDArray[np.intp], floor: float
-) -> Structure:
+def _along(name: str, values: Array, weight: Array, covariate: Array, block: Index, floor: float) -> Structure:
     edges = np.unique(np.quantile(covariate, np.linspace(0, 1, BINS + 1)[1:-1]))
     number = np.searchsorted(edges, covariate, side="right")
     excess, chi2, freedom, bins = 0.0, 0.0, 0, 0
@@ -64,7 +62,7 @@ def _along(
     return Structure(name, float(np.sqrt(excess / bins)), chi2_tail(chi2, freedom))
 
 
-def _mean_of_blocks(values: Array, weight: Array, block: NDArray[np.intp]) -> tuple[float, float, int]:
+def _mean_of_blocks(values: Array, weight: Array, block: Index) -> tuple[float, float, int]:
     """(weighted mean, its standard error from the scatter between blocks, number of blocks)."""
     if not len(values):
         return 0.0, 0.0, 0

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.candidates import FarStart
 from virest.diagnosis.field.bridging import Bridges, doubtful_pairs, with_bridges
@@ -22,7 +22,7 @@ from virest.diagnosis.picture_ladder import Reader
 from virest.image_formation.light import flicker
 from virest.image_formation.row_clock import RowClock
 from virest.inference import profile_terms as terms_of
-from virest.inference.coarse_alignment import align_coarsely, align_with_skew
+from virest.inference.coarse_alignment import MIN_MOTION_PX, align_coarsely, align_with_skew
 from virest.inference.frame_rotations import gyro_turns
 from virest.inference.frame_selection import high_motion_frames
 from virest.inference.observed_tracks import CELLS, ObservedTracks
@@ -32,12 +32,14 @@ from virest.inference.track_fit import Term
 from virest.inference.track_noise import step_noise_px
 from virest.motion.integration import integrate_gyro
 
-Array = NDArray[np.float64]
 WHOLE_FRAMES, FRAMES_IN_RUNS = 450, 240
 """Captures of up to the first number of frames (15 s at 30 frames per second) are tracked in every frame; longer ones
 in runs of frames whose total length is the second number."""
 MIN_PAIRS = 6
-MIN_EXPLAINED, MIN_MOTION_PX = 0.3, 0.4
+"""Fewest pairs of frames; each is then a time block of its own: three to fit and three to judge."""
+MIN_EXPLAINED = 0.3
+"""Least part of the frames' rotation that the gyroscope must explain for a fit to start; below what `calibrate` needs
+(coarse_alignment.MIN_EXPLAINED), because the profile may be wrong."""
 AXIS_EXPLAINED = 0.6
 """Minimum squared correlation between the rotations of frames and gyroscope about one axis."""
 WELL_EXPLAINED = 0.98
@@ -120,7 +122,7 @@ class TrackedPoints:
         return found
 
 
-def _common_motion(difference_px: Array, group: NDArray[np.intp]) -> float:
+def _common_motion(difference_px: Array, group: Index) -> float:
     """Intraclass correlation of residuals (n, 2) within groups, here neighbours in one pair of frames.
 
     Badly tracked neighbours share nothing; points on one moving object share its motion.
@@ -154,19 +156,17 @@ def lighting_changes(profile: CameraProfile) -> bool:
 def with_flicker_of(profile: CameraProfile, lit: CameraProfile) -> CameraProfile:
     """The profile with the flicker of another: flicker shifts the mean time of each row's light."""
     light = lit.extensions
-    extensions = replace(
-        profile.extensions,
+    return profile.with_extensions(
         flicker_amplitude=light.flicker_amplitude,
         flicker_frequency_hz=light.flicker_frequency_hz,
         flicker_phase_rad=light.flicker_phase_rad,
     )
-    return replace(profile, extensions=extensions)
 
 
 def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Reader:
     """The same pictures without flicker and gain changes, for tracking."""
     by_index = {frame.index: frame for frame in frames}
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     height, width, shutter, clock = profile.height, profile.width, profile.shutter, RowClock(profile)
     along = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     rows_px = along[:1] if shutter.reads_columns else along[:, :1]

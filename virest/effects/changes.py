@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from virest.arrays import Array
 from virest.camera.gyro_filter import cutoff_hz, delay_s
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.errors import SettingsError
 
-Array = NDArray[np.float64]
 CUTOFFS_HZ = (0.02, 20.0)
 """Bounds of a stabiliser's cutoff while it is fitted."""
 
@@ -25,16 +23,6 @@ def lens_of(profile: CameraProfile) -> Intrinsics:
     if profile.intrinsics is None:
         raise SettingsError("the focal length is unknown", hint="set intrinsics.fx_px in camera.yaml")
     return profile.intrinsics
-
-
-def with_shutter(profile: CameraProfile, **changes: Any) -> CameraProfile:
-    """The profile with values of its shutter replaced."""
-    return replace(profile, shutter=replace(profile.shutter, **changes))
-
-
-def extended(profile: CameraProfile, **changes: Any) -> CameraProfile:
-    """The profile with values of its extensions replaced."""
-    return replace(profile, extensions=replace(profile.extensions, **changes))
 
 
 def shift_offset(profile: CameraProfile, v: Array) -> CameraProfile:
@@ -66,19 +54,19 @@ def scale_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
 def delay_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] seconds to the delay of the gyroscope's low-pass filter; no physical filter has a negative delay."""
     late_s = delay_s(profile.extensions.gyro_lowpass_hz) + float(v[0])
-    return extended(profile, gyro_lowpass_hz=cutoff_hz(late_s))
+    return profile.with_extensions(gyro_lowpass_hz=cutoff_hz(late_s))
 
 
 def lengthen_readout(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] seconds to the readout time; the first row keeps its time."""
-    return with_shutter(profile, readout_time_s=max(profile.shutter.readout_time_s + float(v[0]), 0.0))
+    return profile.with_shutter(readout_time_s=max(profile.shutter.readout_time_s + float(v[0]), 0.0))
 
 
 def keep_readout(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
     """Restore the given readout time and direction; the middle row keeps its time."""
     middle = (profile.time_offset_s or 0.0) + 0.5 * profile.shutter.readout_time_s
     readout_time_s, direction = given.shutter.readout_time_s, given.shutter.readout_direction
-    back = with_shutter(profile, readout_time_s=readout_time_s, readout_direction=direction)
+    back = profile.with_shutter(readout_time_s=readout_time_s, readout_direction=direction)
     return replace(back, time_offset_s=middle - 0.5 * readout_time_s)
 
 
@@ -102,7 +90,7 @@ def keep_value(name: str) -> Callable[[CameraProfile, CameraProfile], CameraProf
 def add_readout(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] seconds to the readout time; the middle row keeps its time.  A negative sum reverses the direction."""
     signed = profile.shutter.readout_time_s + float(v[0])
-    return with_shutter(shift_offset(profile, np.array([-0.5 * v[0]])), readout_time_s=signed)
+    return shift_offset(profile, np.array([-0.5 * v[0]])).with_shutter(readout_time_s=signed)
 
 
 def scale_focal(profile: CameraProfile, v: Array) -> CameraProfile:
@@ -152,20 +140,19 @@ def principal_shift(before: CameraProfile, after: CameraProfile) -> Array:
 
 def scale_exposure(profile: CameraProfile, v: Array) -> CameraProfile:
     """Multiply the exposure scale by exp(v[0])."""
-    return with_shutter(profile, exposure_scale=profile.shutter.exposure_scale * float(np.exp(v[0])))
+    return profile.with_shutter(exposure_scale=profile.shutter.exposure_scale * float(np.exp(v[0])))
 
 
 def drift_focal(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] 1/s to the drift of the focal length."""
-    return extended(profile, focal_drift_per_s=profile.extensions.focal_drift_per_s + float(v[0]))
+    return profile.with_extensions(focal_drift_per_s=profile.extensions.focal_drift_per_s + float(v[0]))
 
 
 def stabilise(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] to the stabiliser's fraction, multiply its cutoff by exp(v[1]), add v[2:] rad to its initial lean."""
     before = profile.extensions
     lean = before.stabilisation_lean_rad
-    return extended(
-        profile,
+    return profile.with_extensions(
         stabilisation_fraction=before.stabilisation_fraction + float(v[0]),
         stabilisation_cutoff_hz=float(np.clip(before.stabilisation_cutoff_hz * np.exp(v[1]), *CUTOFFS_HZ)),
         stabilisation_lean_rad=(lean[0] + float(v[2]), lean[1] + float(v[3])),

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 
-Array = NDArray[np.float64]
 GEOMETRY, PHOTOMETRY, BLUR, EDGES = "geometry_rms_px", "photometric_rms", "blur_rms_px", "edge_profile_rms"
 """The evidence: tracked points, brightness along them, blur of image regions, profiles of edges."""
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from virest.arrays import Array, Mask
 
 
 def angle_rad(a: Array, b: Array, c: Array) -> Array:
@@ -43,7 +42,7 @@ class Rectangle:
         return lattice[rows, columns]
 
 
-def largest_rectangle(known: NDArray[np.bool_]) -> Rectangle | None:
+def largest_rectangle(known: Mask) -> Rectangle | None:
     """Rectangle of the most lattice cells whose four corners are all known; known: (rows, columns).  None if none."""
     best, most = None, 0
     for top, bottom in ((i, k) for i in range(len(known)) for k in range(i + 1, len(known))):

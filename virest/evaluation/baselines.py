@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
+from virest.arrays import Array, Picture
 from virest.camera.response import ResponseCurve
 from virest.evaluation.dong2020 import Weights, filtered, poisson_tv_l0
 from virest.image_formation.kernels import KernelField, blur_chords, kernel_field
@@ -24,7 +25,6 @@ from virest.image_formation.row_motion import RowMotion
 from virest.restoration.encoding import encode_picture
 from virest.restoration.shutter import rowwise_map, warp
 
-Picture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
 Deconvolve = Callable[[Plane, Plane, Any], Plane]
 ANCHOR = 0.5
@@ -153,7 +153,7 @@ def straight_psf(motion: RowMotion) -> Plane:
     return kernel[::-1, ::-1] / kernel.sum()
 
 
-def _centre(motion: RowMotion) -> NDArray[np.float64]:
+def _centre(motion: RowMotion) -> Array:
     return np.array([[(motion.profile.width - 1) / 2, (motion.profile.height - 1) / 2]])
 
 

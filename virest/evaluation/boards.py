@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.camera.intrinsics import Intrinsics
 
-Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 ATTEMPTS = (((5, 4), 0), ((5, 4), cv2.CALIB_CB_NORMALIZE_IMAGE), ((4, 3), cv2.CALIB_CB_NORMALIZE_IMAGE))
 """Minimum inner corners along both sides, and OpenCV flags; a larger minimum size is detected more reliably."""
@@ -164,7 +164,7 @@ def _unit_lattice(rows: int, columns: int) -> Array:
     return np.stack(np.meshgrid(np.arange(columns, dtype=float), np.arange(rows, dtype=float)), axis=-1)
 
 
-def _grid_columns(centres_px: Array, number: NDArray[np.intp]) -> tuple[int, Array] | None:
+def _grid_columns(centres_px: Array, number: Index) -> tuple[int, Array] | None:
     """Number of tag columns for which row-by-row numbering fits a plane, and the image-from-grid homography (3, 3)."""
     best: tuple[float, int, Array] | None = None
     for columns in range(2, MAX_GRID_COLUMNS + 1):
@@ -182,7 +182,7 @@ def _grid_columns(centres_px: Array, number: NDArray[np.intp]) -> tuple[int, Arr
     return None if best is None or best[0] > 0.2 * side else best[1:]
 
 
-def _tag_lattice(tags: Array, number: NDArray[np.intp], columns: int, grid_from_picture: Array) -> Array:
+def _tag_lattice(tags: Array, number: Index, columns: int, grid_from_picture: Array) -> Array:
     """Arrange tag corners (n, 4, 2) in a lattice (2 rows, 2 columns, 2) by their side of the tag's centre."""
     flat = cv2.perspectiveTransform(tags.reshape(1, -1, 2), grid_from_picture).reshape(tags.shape)
     grid = np.stack([number % columns, number // columns], axis=-1)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from virest.arrays import Picture
 from virest.camera.response import ResponseCurve
 from virest.evaluation.baselines import ANCHOR
 from virest.image_formation.neighbour import neighbour_view
@@ -24,7 +25,6 @@ from virest.motion.trajectory import Trajectory
 from virest.restoration.encoding import encode_picture
 from virest.restoration.shutter import rowwise_map, warp
 
-Picture = NDArray[np.uint8]
 Light = NDArray[np.float32]
 REACHES = (1, 2, 3)
 """Numbers of neighbours on each side to try."""
@@ -63,7 +63,7 @@ def align_frames(
 ) -> AlignedFrames:
     """Align frames, given with their movie index, to the pixels of frame ``here``."""
     motion = motions[here]
-    curve = motion.profile.response or ResponseCurve("srgb")
+    curve = motion.profile.curve
     table = curve.linear_table()
     light = {}
     for number, picture in numbered:

@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask, Picture
 from virest.capture.pixels import luma_of
 from virest.inference.tracking import TrackingSettings, find_corners
 
-Picture = NDArray[np.uint8]
-Array = NDArray[np.float64]
 MARGIN_PX = 16
 """Excludes pixels that blur mixes with the replicated edge."""
 PEAK = 255.0
@@ -137,9 +136,7 @@ def _smooth_grey(picture: Picture) -> NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(luma_of(picture).astype(np.float32), (0, 0), SHIFT_SMOOTHING_PX), np.float32)
 
 
-def _follow(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], points: NDArray[np.float32]
-) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+def _follow(first: Picture, second: Picture, points: NDArray[np.float32]) -> tuple[Mask, NDArray[np.float32]]:
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.003)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
         first, second, points[:, None], None, winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS, criteria=criteria

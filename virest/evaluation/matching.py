@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Picture
 from virest.capture.pixels import luma_of
 
-Picture = NDArray[np.uint8]
 RATIO = 0.75
 """Of the distances to the best and second-best match; Lowe gives 0.8, OpenCV's tutorials 0.75."""
 IN_PLACE_PX = 2.0

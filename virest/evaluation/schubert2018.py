@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.shutter import Shutter
 from virest.image_formation.row_clock import row_time_s
 from virest.inference.tracking import TrackPair
 
-Array = NDArray[np.float64]
 MIN_POINTS = 12
 """Four times the three points that determine an affine field."""
 REWEIGHTINGS = 12

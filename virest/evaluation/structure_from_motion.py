@@ -15,28 +15,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from virest.arrays import Array
 from virest.camera.colmap import colmap_camera
 from virest.camera.intrinsics import Intrinsics
 from virest.errors import SettingsError
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class SfmSettings:
-    """Settings of COLMAP."""
-
-    max_features: int = 500
-    """Maximum SIFT features per frame."""
-    overlap: int = 6
-    """Each frame is matched with this many following frames, and with those 8, 16, 32, … frames later."""
-    least_angle_deg: float = 6.0
-    """Minimum triangulation angle of the initial pair; COLMAP's default of 16° suits photographs, not a short movie."""
-    threads: int = 1
-    """One thread keeps the order of summation, and so the result, reproducible."""
+MAX_FEATURES = 500
+"""SIFT features per frame."""
+OVERLAP = 6
+"""Each frame is matched with this many following frames, and with those 8, 16, 32, … frames later."""
+LEAST_ANGLE_DEG = 6.0
+"""Minimum triangulation angle of the initial pair; COLMAP's default of 16° suits photographs, not a short movie."""
+THREADS = 1
+"""One thread keeps the order of summation, and so the result, reproducible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +63,7 @@ def require_pycolmap() -> Any:
     return pycolmap
 
 
-def match_pictures(pictures: Path, work: Path, lens: Intrinsics, settings: SfmSettings) -> Path:
+def match_pictures(pictures: Path, work: Path, lens: Intrinsics) -> Path:
     """Extract features of all frames in a folder and match neighbours by descriptor: path of the database.
 
     This step is deterministic, so runs with different seeds can share the database.
@@ -79,13 +72,11 @@ def match_pictures(pictures: Path, work: Path, lens: Intrinsics, settings: SfmSe
     database = work / "matches.db"
     model, parameters = colmap_camera(lens)
     reader = colmap.ImageReaderOptions(camera_model=model, camera_params=",".join(f"{p:.9g}" for p in parameters))
-    extraction = colmap.FeatureExtractionOptions(num_threads=settings.threads, use_gpu=False)
-    extraction.sift.max_num_features = settings.max_features
+    extraction = colmap.FeatureExtractionOptions(num_threads=THREADS, use_gpu=False)
+    extraction.sift.max_num_features = MAX_FEATURES
     extraction.sift.first_octave = 0
-    matching = colmap.FeatureMatchingOptions(
-        num_threads=settings.threads, use_gpu=False, skip_geometric_verification=True
-    )
-    pairing = colmap.SequentialPairingOptions(overlap=settings.overlap, num_threads=settings.threads)
+    matching = colmap.FeatureMatchingOptions(num_threads=THREADS, use_gpu=False, skip_geometric_verification=True)
+    pairing = colmap.SequentialPairingOptions(overlap=OVERLAP, num_threads=THREADS)
     cpu = colmap.Device.cpu
     colmap.extract_features(
         database,
@@ -99,18 +90,18 @@ def match_pictures(pictures: Path, work: Path, lens: Intrinsics, settings: SfmSe
     return database
 
 
-def find_path(database: Path, work: Path, seed: int, settings: SfmSettings) -> SfmPath:
+def find_path(database: Path, work: Path, seed: int) -> SfmPath:
     """Verify the matches and map, both with this seed; the largest model is returned, an empty one if mapping fails."""
     colmap = require_pycolmap()
     run_folder = work / f"seed_{seed}"
     run_folder.mkdir(parents=True)
     verified = Path(shutil.copyfile(database, run_folder / "verified.db"))
     colmap.set_random_seed(seed)
-    verifier = colmap.GeometricVerifierOptions(num_threads=settings.threads)
+    verifier = colmap.GeometricVerifierOptions(num_threads=THREADS)
     two_view = colmap.TwoViewGeometryOptions()
     two_view.ransac.random_seed = seed
     colmap.geometric_verification(verified, verifier, two_view_geometry_options=two_view)
-    models = colmap.incremental_mapping(verified, run_folder, run_folder, _mapping(colmap, seed, settings))
+    models = colmap.incremental_mapping(verified, run_folder, run_folder, _mapping(colmap, seed))
     if not models:
         return SfmPath((), np.empty((0, 3)), np.empty((0, 4)), 0)
     return _path(max(models.values(), key=lambda model: model.num_reg_images()))
@@ -119,10 +110,10 @@ def find_path(database: Path, work: Path, seed: int, settings: SfmSettings) -> S
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _mapping(colmap: Any, seed: int, settings: SfmSettings) -> Any:
+def _mapping(colmap: Any, seed: int) -> Any:
     """Options of incremental mapping with a fixed lens."""
     options = colmap.IncrementalPipelineOptions(
-        num_threads=settings.threads,
+        num_threads=THREADS,
         random_seed=seed,
         multiple_models=False,
         extract_colors=False,
@@ -133,7 +124,7 @@ def _mapping(colmap: Any, seed: int, settings: SfmSettings) -> Any:
         ba_global_frames_ratio=1.3,
         ba_global_points_ratio=1.3,
     )
-    options.mapper.init_min_tri_angle = settings.least_angle_deg
+    options.mapper.init_min_tri_angle = LEAST_ANGLE_DEG
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
     options.mapper.random_seed = options.triangulation.random_seed = seed

@@ -10,13 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
+from virest.arrays import Array
 from virest.errors import CaptureError, SettingsError
-
-Array = NDArray[np.float64]
 
 LEAST_POSES = 4
 """Three points can always be aligned; an error needs one more."""

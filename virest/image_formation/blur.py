@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation import transforms
 
 Image = NDArray[np.float32]
@@ -36,7 +37,7 @@ class TileGrid:
     overlap: int
 
     @property
-    def centres_px(self) -> NDArray[np.float64]:
+    def centres_px(self) -> Array:
         """(n, 2) middle of each tile's window, x then y, clipped to the picture."""
         x, y = np.meshgrid(np.array(self.lefts) + (self.side - 1) / 2, np.array(self.tops) + (self.side - 1) / 2)
         return np.stack([np.clip(x, 0, self.width - 1), np.clip(y, 0, self.height - 1)], -1).reshape(-1, 2)
@@ -71,7 +72,7 @@ def tile_grid(height: int, width: int, side: int, overlap: int) -> TileGrid:
     return TileGrid(height, width, tops, lefts, side, overlap)
 
 
-def _ramps(starts: tuple[int, ...], side: int, overlap: int) -> list[NDArray[np.float64]]:
+def _ramps(starts: tuple[int, ...], side: int, overlap: int) -> list[Array]:
     rise = (np.arange(overlap) + 0.5) / overlap
     smooth = rise * rise * (3 - 2 * rise)
     ramps = []

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from virest.arrays import Array
 from virest.image_formation.kernels import KernelField
 
-Array = NDArray[np.float64]
 GRID = 3
 """Grid points along each side at which the spread is evaluated; it varies over a picture as slowly as the motion."""
 

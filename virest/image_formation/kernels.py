@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from virest.arrays import Array, Index
 from virest.image_formation.light import defocus_px, flicker
 from virest.image_formation.row_clock import ROW_END, ROW_START
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
 
-Array = NDArray[np.float64]
 SAMPLES_PER_PX = 2.0
 MIN_SAMPLES = 16
 NODE_STEP_S = 2e-3
@@ -69,7 +69,7 @@ class KernelField:
         kernels = splat_paths(self.paths_px, radius_px or self.radius_px, taps, self.light)
         return _defocused(kernels, self.defocus_sigma_px) if np.any(self.defocus_sigma_px) else kernels
 
-    def chosen(self, numbers: NDArray[np.intp]) -> KernelField:
+    def chosen(self, numbers: Index) -> KernelField:
         """The field of some of the tiles."""
         light = None if self.light is None else self.light[numbers]
         sigma_px = np.broadcast_to(self.defocus_sigma_px, len(self.paths_px))[numbers]
@@ -81,12 +81,9 @@ class KernelField:
         return replace(self, paths_px=self.paths_px * scale, defocus_sigma_px=self.defocus_sigma_px * scale)
 
 
-def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5, inverse_depth: Any = None) -> KernelField:
-    """Blur paths of tiles centred at pixels (n, 2), with the rows' own times in both pictures.
-
-    inverse_depth: (n,) of each tile, 1/m; None: that of the frame's plane.  Flicker and defocus are the profile's.
-    """
-    return field_along(motion, centres_px, _path_nodes(motion, centres_px, anchor, inverse_depth), anchor)
+def kernel_field(motion: RowMotion, centres_px: Array, anchor: float = 0.5) -> KernelField:
+    """Blur paths of tiles centred at pixels (n, 2), with the rows' own times in both pictures."""
+    return field_along(motion, centres_px, _path_nodes(motion, centres_px, anchor), anchor)
 
 
 def smooth_field(motion: RowMotion, anchor: float = 0.5) -> Callable[[Array], KernelField]:
@@ -127,14 +124,11 @@ def instants(motion: RowMotion, points_px: Array) -> Array:
     return motion.row_time_s(points_px[:, None], np.linspace(0.0, 1.0, count))
 
 
-def _path_nodes(motion: RowMotion, centres_px: Array, anchor: float, inverse_depth: Any = None) -> Array:
+def _path_nodes(motion: RowMotion, centres_px: Array, anchor: float) -> Array:
     """Displacements (n, k, 2) at evenly spaced instants of the exposure, ends included: a spline's nodes."""
     gathered_s = instants(motion, centres_px)
-    count = gathered_s.shape[1]
-    points = np.broadcast_to(centres_px[:, None], (len(centres_px), count, 2))
-    if inverse_depth is not None:
-        inverse_depth = np.broadcast_to(np.asarray(inverse_depth, float)[..., None], gathered_s.shape)
-    return seen_by_rows(motion, points, gathered_s, anchor, inverse_depth, PIXELS_WITHIN_PX) - points
+    points = np.broadcast_to(centres_px[:, None], (*gathered_s.shape, 2))
+    return seen_by_rows(motion, points, gathered_s, anchor, PIXELS_WITHIN_PX) - points
 
 
 def field_along(motion: RowMotion, centres_px: Array, nodes_px: Array, anchor: float) -> KernelField:
@@ -167,13 +161,13 @@ def _between(count: int, samples: int) -> Array:
     return np.asarray(CubicSpline(np.linspace(0.0, 1.0, count), np.eye(count))(middles))
 
 
-def blur_chords(motion: RowMotion, points_px: Array, inverse_depth: Any = None) -> Array:
+def blur_chords(motion: RowMotion, points_px: Array) -> Array:
     """Motion (n, 2) in pixels of image points over the exposure of their own rows, start to end (eqs 12-14).
 
     Its angle and length are the paper's degradation parameters (eqs 15, 16); see :func:`angle_and_length`.
     """
     start_s, end_s = (motion.row_time_s(points_px, share) for share in (ROW_START, ROW_END))
-    return moved_between(motion, points_px, start_s, end_s, inverse_depth) - points_px
+    return moved_between(motion, points_px, start_s, end_s) - points_px
 
 
 def angle_and_length(chords_px: Array) -> tuple[Array, Array]:
@@ -209,11 +203,11 @@ def _defocused(kernels: NDArray[np.float32], sigma_px: Array | float) -> NDArray
     return np.stack([k / s for k, s in zip(blurred, sums, strict=True)])
 
 
-def _linear_taps(part: Array) -> tuple[NDArray[np.intp], Array]:
+def _linear_taps(part: Array) -> tuple[Index, Array]:
     return np.arange(0, 2), np.stack([1 - part, part], -1)
 
 
-def _cubic_taps(part: Array) -> tuple[NDArray[np.intp], Array]:
+def _cubic_taps(part: Array) -> tuple[Index, Array]:
     rest = 1 - part
     weights = [
         -0.5 * part * rest**2,

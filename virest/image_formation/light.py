@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.image_formation.row_clock import ROW_MIDDLE
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import grid_filled, straightened_points
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 LEAST_LIGHT = 0.05
 """Smallest fraction of the light that is compensated; below it mostly noise would be amplified."""

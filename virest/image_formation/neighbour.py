@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation.kernels import KernelField, field_along, instants, splined_nodes
 from virest.image_formation.row_motion import FurtherTurn, RowMotion, covering_both, with_row_clock_of
 from virest.image_formation.warp import PIXELS_WITHIN_PX, grid_filled, seen_by_rows
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 STEP_RAD = 1e-5
 """Step of numerical slopes: about 0.01 px."""
@@ -40,7 +39,7 @@ class NeighbourView:
     def places_px(self, points_px: Array) -> Array:
         """Pixels at which the neighbour recorded what the frame's anchored picture shows at pixels (..., 2)."""
         seen_s = self.frame.row_time_s(points_px, self.anchor)
-        return seen_by_rows(self.neighbour, points_px, seen_s, self.anchor, None, PIXELS_WITHIN_PX)
+        return seen_by_rows(self.neighbour, points_px, seen_s, self.anchor, PIXELS_WITHIN_PX)
 
     def apart_s(self, points_px: Array) -> Array:
         """(n,) time from the frame's to the neighbour's observation of what the frame shows at pixels (n, 2)."""
@@ -68,7 +67,7 @@ class NeighbourView:
             places = self.places_px(centres_px)
             gathered_s = instants(self.neighbour, places)
             points = np.broadcast_to(places[:, None], (*gathered_s.shape, 2))
-            seen = seen_by_rows(self.frame, points, gathered_s, self.anchor, None, PIXELS_WITHIN_PX)
+            seen = seen_by_rows(self.frame, points, gathered_s, self.anchor, PIXELS_WITHIN_PX)
             return seen - centres_px[:, None]
 
         at = splined_nodes(self.frame, nodes)

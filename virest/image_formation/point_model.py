@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
@@ -29,8 +29,6 @@ from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 from virest.motion.trajectory import Orientations, Trajectory
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 SMALLEST_DEPTH = 0.05
 """Smallest depth of points in front of the camera, relative to the typical depth."""
 RAY_STEP = 1e-5
@@ -93,7 +91,7 @@ class TrackTable:
         """Number of windows."""
         return len(self.origin_s)
 
-    def chosen(self, rows: NDArray[np.bool_]) -> TrackTable:
+    def chosen(self, rows: Mask) -> TrackTable:
         """The table with some of its points; pairs keep their numbers."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _PER_POINT})
 

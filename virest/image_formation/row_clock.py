@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 
-Array = NDArray[np.float64]
 ROW_START, ROW_MIDDLE, ROW_END = 0.0, 0.5, 1.0
 """Fractions of an exposure."""
 ROWS = np.linspace(0.0, 1.0, 41)
@@ -39,7 +39,7 @@ def of_frame(profile: CameraProfile, stamp_s: float, logged_exposure_s: float) -
     if blurs:
         even = profile.extensions.defocus_sigma_px
         sigma_px = float(np.hypot.reduce([even, *(float(field.at_time(stamp_s)[0]) for field in blurs)]))
-        profile = replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=sigma_px))
+        profile = profile.with_extensions(defocus_sigma_px=sigma_px)
         profile = profile.with_fields([field for field in profile.fields if field not in blurs])
     changing, shutter = _changing_rows(profile), profile.shutter
     if not changing:
@@ -115,8 +115,5 @@ def right_way_round(profile: CameraProfile) -> CameraProfile:
     }[shutter.readout_direction]
     rows = profile.width if shutter.reads_columns else profile.height
     moved = row_time_s(0.0, shutter.readout_time_s, 1 - 1 / rows)
-    return replace(
-        profile,
-        time_offset_s=(profile.time_offset_s or 0.0) + moved,
-        shutter=replace(shutter, readout_time_s=-shutter.readout_time_s, readout_direction=opposite),
-    )
+    other = profile.with_shutter(readout_time_s=-shutter.readout_time_s, readout_direction=opposite)
+    return replace(other, time_offset_s=(profile.time_offset_s or 0.0) + moved)

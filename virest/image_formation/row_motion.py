@@ -6,15 +6,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START, RowClock, of_frame, row_time_s
+from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, RowClock, of_frame, row_time_s
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.relief_surface import Relief
 from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_from_rotation
 
-Array = NDArray[np.float64]
 STEP_S = 2e-4
 """Step of the tabulated motion: at 50 rad/s² linear interpolation errs by 2.5e-7 rad."""
 OUTSIDE_FRACTION = 0.25
@@ -154,10 +153,6 @@ class RowMotion:
         """Time at which the rows through pixels (..., 2) reach a share of their exposure."""
         fraction = RowClock(self.profile).readout_fraction(points_px)
         return np.asarray(row_time_s(self.start_s, self.readout_time_s, fraction, self.exposure_s, exposure_share))
-
-    def row_start_s(self, points_px: Array) -> Array:
-        """Start of exposure of the rows through pixels (..., 2)."""
-        return self.row_time_s(points_px, ROW_START)
 
     def pose(self, time_s: Any) -> tuple[Array, Array | None]:
         """(R_t_ref (..., 3, 3), t_t_ref (..., 3) or None) at times (...)."""

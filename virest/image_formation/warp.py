@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from virest.arrays import Array
 from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 
-Array = NDArray[np.float64]
 FIXED_POINT_PX = 1e-5
 """The iteration over row times ends when points move less than this."""
 PIXELS_WITHIN_PX = 1e-3
@@ -51,32 +51,22 @@ class CameraMotion(Protocol):
         """1 / depth (...) where rays (..., 3), z = 1, meet the scene at times (...)."""
 
 
-def moved_between(motion: CameraMotion, points_px: Array, from_s: Any, to_s: Any, inverse_depth: Any = None) -> Array:
+def moved_between(motion: CameraMotion, points_px: Array, from_s: Any, to_s: Any) -> Array:
     """Pixels (..., 2) at another time of points seen at pixels (..., 2) at one time."""
-    return _shown(motion, *_fixed_points(motion, points_px, from_s, inverse_depth), to_s)
+    return _shown(motion, *_fixed_points(motion, points_px, from_s), to_s)
 
 
-def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
+def straightened_points(motion: RowMotion, points_px: Array, anchor: float = 0.0) -> Array:
     """p_g of eq 28: positions at the reference time of points of the recorded picture, (..., 2).
 
     anchor: fraction of its exposure that represents each row; 0: its start (the paper), 0.5: its middle.
     """
     seen_s = motion.row_time_s(points_px, anchor)
-    return moved_between(motion, points_px, seen_s, motion.reference_s, inverse_depth)
-
-
-def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0, inverse_depth: Any = None) -> Array:
-    """The inverse of :func:`straightened_points`: recorded positions of points of the picture at the reference time."""
-    return seen_by_rows(motion, points_px, motion.reference_s, anchor, inverse_depth)
+    return moved_between(motion, points_px, seen_s, motion.reference_s)
 
 
 def seen_by_rows(
-    motion: CameraMotion,
-    points_px: Array,
-    at_s: Any,
-    anchor: float,
-    inverse_depth: Any = None,
-    within_px: float = FIXED_POINT_PX,
+    motion: CameraMotion, points_px: Array, at_s: Any, anchor: float, within_px: float = FIXED_POINT_PX
 ) -> Array:
     """Positions in the picture of anchored rows of points seen at pixels (..., 2) at time ``at_s``.
 
@@ -84,7 +74,7 @@ def seen_by_rows(
     position.  For many frames at once, the motion is that of the target frames; its poses must also cover ``at_s``.
     """
     seen = points_px
-    fixed = _fixed_points(motion, points_px, at_s, inverse_depth)
+    fixed = _fixed_points(motion, points_px, at_s)
     for _ in range(FIXED_POINT_STEPS if motion.readout_time_s else 1):
         before = seen
         seen = _shown(motion, *fixed, motion.row_time_s(seen, anchor))
@@ -98,16 +88,16 @@ def corner_points(width: int, height: int) -> Array:
     return np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
 
 
-def dense_map(motion: RowMotion, anchor: float, spacing_px: int = 16, inverse_depth: Any = None) -> NDArray[np.float32]:
-    """:func:`recorded_points` of every pixel, (height, width, 2), as cv2.remap expects it.
+def dense_map(motion: RowMotion, anchor: float) -> NDArray[np.float32]:
+    """Where the rows saw every pixel of the reference time, (height, width, 2), as cv2.remap expects it.
 
     Computed on a grid and interpolated; the map is smooth, so the error is below 0.01 px.
     """
 
     def recorded(points: Array) -> Array:
-        return seen_by_rows(motion, points, motion.reference_s, anchor, inverse_depth, PIXELS_WITHIN_PX)
+        return seen_by_rows(motion, points, motion.reference_s, anchor, PIXELS_WITHIN_PX)
 
-    return grid_filled(motion, recorded, spacing_px)
+    return grid_filled(motion, recorded)
 
 
 def grid_filled(
@@ -153,14 +143,14 @@ def _knots(length: int, spacing: int) -> tuple[Array, Array]:
     return knots, np.asarray(CubicSpline(knots, np.eye(count))(nodes))
 
 
-def _fixed_points(motion: CameraMotion, points_px: Array, at_s: Any, inverse_depth: Any) -> tuple[Array, Array | None]:
+def _fixed_points(motion: CameraMotion, points_px: Array, at_s: Any) -> tuple[Array, Array | None]:
     """Points (..., 3), fixed axes, in units of their depths at ``at_s``; 1 / those, (...)."""
     rays = motion.optics.rays(points_px, at_s)
     rotation, translation = motion.pose(at_s)
     back = np.swapaxes(rotation, -1, -2)
     if translation is None:
         return np.squeeze(back @ rays[..., None], -1), None
-    nearness = motion.inverse_depth(rays, at_s) if inverse_depth is None else np.asarray(inverse_depth, float)
+    nearness = motion.inverse_depth(rays, at_s)
     return np.squeeze(back @ (rays - translation * nearness[..., None])[..., None], -1), nearness
 
 

@@ -22,16 +22,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, seen_s
 from virest.inference.guidance import applied_blur
 from virest.inference.tracking import TrackingSettings, shrink_factor
 from virest.motion.trajectory import turned
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 RELATIVE_STD = 0.35
 """Relative standard deviation of e, because textures differ."""
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4
@@ -41,9 +38,11 @@ NODES = 15
 MOST_SHIFT_PX = 0.3
 """Larger e are clipped to this: the first order holds for shifts that are small relative to a corner's detail."""
 LEAST_BLUR_PX = 0.3
+"""Points with less blur in both frames together have no bias."""
 LEAST_COMMON = 0.5
 """If a smaller fraction of the detail has the same sign in both frames, |Re| replaces Re, so that e stays finite."""
 POINTS_AT_ONCE = 2000
+"""Limits the memory: 80 frequencies and 15 nodes for each point take 10 kB."""
 
 
 def blur_bias_px(known: IntegratedMotion, table: TrackTable, guided: Mask) -> Array:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, centre
 from virest.inference.depth import FrameDepth, TriangulatedPoints, frame_depth
 from virest.inference.profile_terms import GYRO_BIAS, TIME_OFFSET
@@ -16,7 +16,6 @@ from virest.inference.tracking_bias import SHARED_RELIEF
 from virest.motion.displacement import Displacement
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
 OFFSET_FLOOR_S = 3e-5
 """Systematic error of the time offset, added to its standard deviation."""
 ACCEL_SCALE_STD = 0.01
@@ -77,27 +76,6 @@ class Stretch:
         """The fitted path and planes."""
         assert isinstance(self.fit.scene, InertialMotion)
         return self.fit.scene
-
-    def gravity(self) -> tuple[Array, Array]:
-        """Gravity (3,) in world axes, m/s², and its standard deviations."""
-        return self.scene.gravity_m_s2, self._std(slice(0, 3))
-
-    def accel_bias(self) -> tuple[Array, Array]:
-        """The accelerometer's bias (3,) in IMU axes, m/s², and its standard deviations."""
-        return self.scene.accel_bias_m_s2, self._std(slice(3, 6))
-
-    def accel_delay(self) -> tuple[float, float]:
-        """Seconds by which accelerations are older than their stamps, and the standard deviation."""
-        return self.scene.accel_delay_s, float(self._std(slice(6, 7))[0])
-
-    def _std(self, part: slice) -> Array:
-        return np.sqrt(np.maximum(np.diag(self.scene_covariance)[part], 0.0))
-
-    @property
-    def scene_covariance(self) -> Array:
-        """Of the scene's vector."""
-        terms = len(self.fit.change)
-        return self.fit.covariance[terms:, terms:]
 
     def origin_s(self, window: int) -> float:
         """Middle of a window, IMU clock."""
@@ -259,11 +237,6 @@ class VisualInertialAlignment:
         return tuple(window for stretch in self.stretches for window in stretch.windows)
 
     @property
-    def trusted(self) -> bool:
-        """Whether any window's velocity is known in metres."""
-        return any(not window.reason for window in self.windows)
-
-    @property
     def refused(self) -> str:
         """The most frequent reason why windows have no metric velocity; empty if all have one."""
         if self.reason:
@@ -276,7 +249,11 @@ class VisualInertialAlignment:
 
         over_depth: accept windows with velocity over depth only.
         """
-        at = [(s, k, _distance(w, camera_time_s), w) for s in self.stretches for k, w in enumerate(s.windows)]
+        at = [
+            (s, k, max(w.start_s - camera_time_s, camera_time_s - w.end_s, 0.0), w)
+            for s in self.stretches
+            for k, w in enumerate(s.windows)
+        ]
         near = [entry for entry in at if entry[2] <= NEAR_WINDOW_S]
         if not near:
             return self.reason or "no tracked points near this frame"
@@ -343,10 +320,6 @@ class VisualInertialAlignment:
 def _std_with_relief(fit: TrackFit, name: str) -> Array:
     """Standard deviations (k,) of a term's values, with the errors from fixed relief."""
     return np.hypot(fit.std(name), SHARED_RELIEF * fit.by_relief[fit.slices[name]])
-
-
-def _distance(window: Window, time_s: float) -> float:
-    return max(window.start_s - time_s, time_s - window.end_s, 0.0)
 
 
 def _mean(value: Array, std: Array) -> tuple[float, float]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from virest.arrays import Array
 from virest.inference.robust import robust_std
 
 
@@ -41,19 +41,19 @@ def normal_deviate(tail: Any) -> float:
     return float(-special.ndtri(tail))
 
 
-def t_ratio(values: NDArray[np.float64]) -> float:
+def t_ratio(values: Array) -> float:
     """Mean of values (n,) over its standard error; 0 for fewer than three."""
     if len(values) < 3:
         return 0.0
     return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-12))
 
 
-def chance_of(values: NDArray[np.float64]) -> float:
+def chance_of(values: Array) -> float:
     """One-sided p value of a t test that the mean of values (n,) is positive; 0.5 for fewer than three."""
     return student_tail(t_ratio(values), max(len(values) - 1, 1))
 
 
-def beyond_noise(gain: NDArray[np.float64]) -> float:
+def beyond_noise(gain: Array) -> float:
     """Sum of gains (blocks,) over its standard deviation without any gain, from the robust scatter of the blocks.
 
     An effect on a few blocks, such as a lens that settles within the first 0.5 s, gains only there.  A t test over all

@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.inference.frame_rotations import FrameRotations, gyro_turns
 from virest.motion.integration import integrate_gyro
 
-Array = NDArray[np.float64]
 STEP_S = 0.004
+"""Of the searched offsets; half or twice changes no fit that starts there (two simulated captures)."""
 MIN_COVERED = 0.75
 """Smallest fraction of the pairs that must lie inside the inertial data."""
 PLANAR = 0.05
@@ -29,7 +29,9 @@ KEEP_PROFILE = 1.15
 MAX_PROFILE_LEFT = 0.3
 """Keep the profile's axes at the same offset if they leave less than this fraction unexplained."""
 SAME_VALLEY_S = 0.06
+"""Offsets of the profile's axes and of free ones that lie this close are the same."""
 SKEWS = (-0.0045, -0.003, -0.0015, 0.0015, 0.003, 0.0045)
+"""Changes of the clock skew that are tried: up to 13 ms over 3 s."""
 SKEW_GAIN = 0.8
 """Accept another clock rate if it leaves less than this fraction of what the profile's rate leaves unexplained."""
 SOFTENING = 3.0
@@ -191,7 +193,7 @@ def axis_maps() -> Array:
     return np.array(maps)
 
 
-def _best_rotations(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _best_rotations(seen: Array, gyro: Array, inside: Mask) -> tuple[Array, Array]:
     """Explained fraction (k,) and rotation (k, 3, 3) at each offset, reweighted once against outlying pairs."""
     weight = inside.astype(float)
     for _ in range(2):
@@ -210,22 +212,20 @@ def _best_rotations(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> tupl
     return explained, rotation
 
 
-def _gains(seen: Array, gyro: Array, inside: NDArray[np.bool_]) -> Array:
+def _gains(seen: Array, gyro: Array, inside: Mask) -> Array:
     """Gains (k,) of pitch and yaw, frames over gyroscope, both in camera axes."""
     used = inside[..., None]
     cross = (seen[:, :2] * gyro[..., :2] * used).sum(axis=(1, 2))
     return np.clip(cross / np.maximum((gyro[..., :2] ** 2 * used).sum(axis=(1, 2)), 1e-18), *GAINS)
 
 
-def _soft_weights(seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array) -> Array:
+def _soft_weights(seen: Array, gyro: Array, inside: Mask, rotation: Array) -> Array:
     squared = ((seen - gyro @ np.swapaxes(rotation, -1, -2)) ** 2).sum(axis=-1)
     scale = np.maximum(np.median(squared, axis=1, keepdims=True), 1e-14)
     return inside / (1 + squared / (SOFTENING**2 * scale))
 
 
-def _explained(
-    seen: Array, gyro: Array, inside: NDArray[np.bool_], rotation: Array, gain: Array | None = None
-) -> Array:
+def _explained(seen: Array, gyro: Array, inside: Mask, rotation: Array, gain: Array | None = None) -> Array:
     """1 − (residual power) / (power), saturated beyond the typical rotation, so that outlying pairs do not dominate."""
     predicted = gyro @ np.swapaxes(rotation, -1, -2)
     if gain is not None:

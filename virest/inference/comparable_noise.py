@@ -7,23 +7,15 @@ relief along the parallax; the noise here is discounted in the same way.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation.point_model import predict
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.track_fit import ANY_DEPTH, TrackFit
-from virest.inference.track_noise import (
-    ORDERS,
-    POINTS_PER_TERM,
-    REWEIGHTINGS,
-    flow_basis,
-    smooth_flow_residual,
-)
+from virest.inference.track_noise import ORDERS, POINTS_PER_TERM, REWEIGHTINGS, flow_basis, smooth_flow_residual
 from virest.inference.tracking import TrackPair
 from virest.motion.scene_motion import DirectedMotion
-
-Array = NDArray[np.float64]
 
 
 def noise_distances(observed: ObservedTracks, fitted: TrackFit) -> Array:

@@ -10,17 +10,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.image_formation.point_model import SMALLEST_DEPTH, IntegratedMotion, Poses, TrackTable, predict
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, cauchy_weight
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
 PASSES = 3
+"""Gauss-Newton steps of a point near the plane; 2 give the same depths to 0.001 σ."""
 RELIEF_PASSES, RELIEF_REACH = 6, 3.0
+"""The same of points at any distance, and the largest change in one step, in inverse depths of the plane."""
 FARTHEST = 0.02
 """Inverse depths are clipped to at least this fraction of the plane's."""
 MAX_ACROSS = 4.0
@@ -30,11 +31,13 @@ QUOTIENT = 1e-3
 MAX_RELATIVE_STD = 0.5
 """Points with a larger relative standard deviation of the inverse depth are dropped."""
 MIN_POINTS = 20
+"""Fewest points of a frame that shift its plane from its window's."""
 NEAR_S = 1.0
 """A frame uses points seen within this time of it."""
 OUTSIDE = 0.05
 """A frame uses points up to this fraction of the picture's size beyond its edge."""
 REWEIGHTINGS = 6
+"""Passes against outliers; half or twice as many change depths by less than 0.03 σ."""
 LEAST_SPREAD = 0.02
 """Smallest relative standard deviation, at one frame, of a plane fitted to a whole window."""
 
@@ -43,7 +46,7 @@ LEAST_SPREAD = 0.02
 class TriangulatedPoints:
     """Points of the scene, each from one pair of frames."""
 
-    window: NDArray[np.intp]
+    window: Index
     """(n,)."""
     place_m: Array
     """(n, 3) world axes, relative to the camera centre at the window's middle."""
@@ -57,7 +60,7 @@ class TriangulatedPoints:
     def __len__(self) -> int:
         return len(self.window)
 
-    def chosen(self, use: NDArray[np.bool_]) -> TriangulatedPoints:
+    def chosen(self, use: Mask) -> TriangulatedPoints:
         """Some of the points."""
         return TriangulatedPoints(
             self.window[use], self.place_m[use], self.time_s[use], self.inverse_depth_per_m[use], self.std_per_m[use]
@@ -69,7 +72,7 @@ class Sightings:
     """Triangulated points with their first observation."""
 
     points: TriangulatedPoints
-    pair: NDArray[np.intp]
+    pair: Index
     """(n,) number of the pair of frames."""
     from_m: Array
     """(n, 3) camera centre, world axes, relative to its position at the window's middle."""
@@ -83,7 +86,7 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.pair)
 
-    def chosen(self, use: NDArray[np.bool_]) -> Sightings:
+    def chosen(self, use: Mask) -> Sightings:
         """Some of the points."""
         return Sightings(
             self.points.chosen(use), self.pair[use], self.from_m[use], self.rays[use], self.above_per_m[use],

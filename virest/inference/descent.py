@@ -20,15 +20,16 @@ from itertools import accumulate, pairwise
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
-Array = NDArray[np.float64]
 MAX_ITERATIONS = 15
+"""A descent ends here if it has not converged."""
 CONVERGED = 0.02
 """The fit ends when the rms of a step, in the values' standard deviations, is below this."""
 FIRST_DAMPING, MAX_DAMPING = 1e-3, 1e3
+"""Damping after the first step that raises the loss, and where a descent gives up; half or twice changed no fit."""
 
 
 class Slopes(Enum):
@@ -169,11 +170,7 @@ class Evidence(Protocol[S, L]):
 
 
 def descend(
-    evidence: Evidence[S, L],
-    state: S,
-    max_iterations: int = MAX_ITERATIONS,
-    look: L | None = None,
-    fresh: bool = True,
+    evidence: Evidence[S, L], state: S, max_iterations: int = MAX_ITERATIONS, look: L | None = None, fresh: bool = True
 ) -> System[S, L]:
     """Levenberg-Marquardt; the scale of the residuals is updated after each accepted step.
 

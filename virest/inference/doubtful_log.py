@@ -9,17 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Mask
 from virest.capture.imu import ImuSamples
 
-Mask = NDArray[np.bool_]
 STRAIGHT, CLIPPED = "straight", "clipped"
 STRAIGHT_PART = 0.03
 """Second differences below this fraction of their median count as those of a straight line."""
 CHANCE = 1e-6
 """False-alarm probability of a straight run in the log, from the rate of such differences on the three axes."""
 LEAST_STRAIGHT_S = 0.02
+"""Shortest straight run that is doubted."""
 PILE_PART, LEAST_PILED, PILED_RUN = 0.005, 6, 3
 """Readings within PILE_PART of the largest are at the limit; clipping needs LEAST_PILED of them in all, with a run of
 PILED_RUN."""
@@ -78,16 +78,8 @@ def _clipped(imu: ImuSamples, axis: int) -> list[Stretch]:
     longest = max((last - first + 1 for first, last in runs), default=0)
     if at_limit.sum() < max(LEAST_PILED, PILE_RATIO * (below + 1)) or longest < PILED_RUN:
         return []
-    return [
-        Stretch(
-            CLIPPED,
-            float(imu.time_s[max(first - 1, 0)]),
-            float(imu.time_s[min(last + 1, len(size) - 1)]),
-            (axis,),
-            limit,
-        )
-        for first, last in runs
-    ]
+    time_s, end = imu.time_s.tolist(), len(size) - 1
+    return [Stretch(CLIPPED, time_s[max(a - 1, 0)], time_s[min(b + 1, end)], (axis,), limit) for a, b in runs]
 
 
 def _runs(mask: Mask) -> list[tuple[int, int]]:

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
+from virest.arrays import Array, Index, Picture
 
 TANGENT_PX = (-2.0, -1.0, 0.0, 1.0, 2.0)
 """Offsets of the parallel profiles that are averaged: edges are straight over this length."""
@@ -27,10 +26,6 @@ class EdgeSettings:
     """Side of the squares; each gives one edge for each of four directions."""
     min_slope_levels: float = 2.0
     """Smallest slope of a candidate, grey levels per pixel after smoothing by 1 px."""
-    min_step_levels: float = 30.0
-    """Smallest height of a step, grey levels."""
-    max_misfit: float = 0.02
-    """Largest rms of a profile about its fitted step, relative to the step's height."""
 
 
 def find_edges(picture: Picture, settings: EdgeSettings) -> tuple[Array, Array]:
@@ -49,7 +44,7 @@ def find_edges(picture: Picture, settings: EdgeSettings) -> tuple[Array, Array]:
     return here[kept].astype(float), normal[kept].astype(float)
 
 
-def _strongest_per_cell(points: Any, normal: Any, strength: Any, settings: EdgeSettings) -> NDArray[np.intp]:
+def _strongest_per_cell(points: Any, normal: Any, strength: Any, settings: EdgeSettings) -> Index:
     """Index of the strongest edge of each cell and direction, thinned evenly to ``edges_per_frame``."""
     direction = np.floor(np.arctan2(normal[:, 1], normal[:, 0]) % np.pi / (np.pi / 4)).astype(np.intp) % 4
     cell = (points // settings.cell_px).astype(np.intp)
@@ -91,3 +86,11 @@ def parallel_profiles(picture: Picture, points: Array, normals: Array, along_px:
         x, y = where[..., 0].astype(np.float32), where[..., 1].astype(np.float32)
         total += cv2.remap(plane, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT)
     return total / len(TANGENT_PX)
+
+
+def moved_profiles(profiles: Array, middle_px: Array, along_px: Array, grid_px: Array) -> Array:
+    """Profiles (n, m) sampled evenly at ``along_px``, with their middles (n,) moved to 0, on a grid; linear between."""
+    at = (grid_px + middle_px[:, None] - along_px[0]) / (along_px[1] - along_px[0])
+    index = np.clip(at.astype(np.intp), 0, len(along_px) - 2)
+    share, rows = at - index, np.arange(len(profiles))[:, None]
+    return np.asarray(profiles[rows, index] * (1 - share) + profiles[rows, index + 1] * share)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.intrinsics import Intrinsics
 from virest.inference.tracking import TrackPair
 from virest.motion.trajectory import Trajectory, vector_from_rotation
 
-Array = NDArray[np.float64]
 REWEIGHTINGS = 8
+"""Passes against outliers; half or twice as many change no offset of two simulated captures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +53,6 @@ def picture_rotation(lens: Intrinsics, pair: TrackPair) -> Array:
         deviation = np.linalg.norm(second - first @ rotation.T, axis=-1)
         weight = 1.0 / (1.0 + (deviation / max(float(np.median(deviation)), 1e-6)) ** 2)
     return vector_from_rotation(rotation)
-
-
-def picture_turns(lens: Intrinsics, pairs: Sequence[TrackPair], first_s: Array, second_s: Array) -> FrameRotations:
-    """Rotation of every pair; first_s, second_s: (p,) times of the frames' centre rows, camera clock."""
-    vectors = np.array([picture_rotation(lens, pair) for pair in pairs]).reshape(-1, 3)
-    return FrameRotations(first_s, second_s, vectors)
 
 
 def gyro_turns(trajectory: Trajectory, first_s: Array, second_s: Array) -> Array:

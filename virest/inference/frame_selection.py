@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.capture.imu import ImuSamples
 from virest.capture.join import median_period_s
 from virest.capture.records import Frame
 
-Array = NDArray[np.float64]
 RUN_S, MIN_RUN_FRAMES, MAX_RUN_FRAMES = 1.5, 20, 80
+"""Length of a run, and its bounds at low and high frame rates."""
 
 
 def high_motion_frames(

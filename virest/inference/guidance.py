@@ -17,20 +17,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask, Picture
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.image_formation.point_model import IntegratedMotion, integrate_motion, predict
 from virest.image_formation.row_clock import RowClock
 from virest.inference.doubtful_log import doubtful_stretches
 from virest.inference.observed_tracks import frame_times, track_table
-from virest.inference.tracking import Picture, TrackPair
+from virest.inference.tracking import TrackPair
 
-Array = NDArray[np.float64]
 NODES = 8
 """Nodes along each side.  At 5 rad/s of hand motion, 6 nodes err by up to 0.03 px, 8 by less than 0.002 px."""
 ROW_STEPS = 3
 """Row times depend on where a point lands; each step reduces the error about tenfold at 250 px per frame."""
 INVERSE_STEPS, INVERSE_PX = 12, 1e-3
+"""Most steps of the inverse map, which end when a step is shorter than this."""
 LEAST_BLUR_PX, NARROWEST_PX, GAUSSIAN_REACH = 1.0, 0.2, 2.0
 """Smallest σ of blur that is applied; smallest σ of the Gaussian across the path; its extent in σ."""
 
@@ -136,7 +137,7 @@ def gyro_guide(capture: Capture, profile: CameraProfile) -> GyroGuide:
     return GyroGuide(integrate_motion(capture.imu, profile, translation=False), stamp_s, exposure_s)
 
 
-def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure_s: Array) -> NDArray[np.bool_]:
+def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure_s: Array) -> Mask:
     """Mask (frames,): a doubtful, unbridged stretch of the log lies between a frame's first row and the next's last."""
     doubtful = [(stretch.from_s, stretch.to_s) for stretch in doubtful_stretches(capture.imu)]
     doubtful = [span for span in doubtful if not profile.bridges(*span)]

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Picture
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.join import median_period_s
@@ -29,11 +30,10 @@ from virest.inference.frame_selection import choose_pairs
 from virest.inference.guidance import GyroGuide, gyro_guide
 from virest.inference.observed_tracks import frame_times
 from virest.inference.parallel import ParallelMap, one_by_one
-from virest.inference.tracking import Picture, TrackPair, track_frames
+from virest.inference.tracking import TrackPair, track_frames
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Reader = Callable[[Sequence[int]], Iterable[tuple[int, Picture | None]]]
 SAMPLE_FRAMES, RUN_FRAMES = 32, 8
 """Four runs of frames with the highest gyroscope motion."""
@@ -46,14 +46,18 @@ FLAT_LEVELS = 1.5
 STEP_S, NEAR_S, SEARCH_S = 0.008, 0.04, 1.0
 """Step of the offsets; range around the profile's offset, searched first; full range."""
 FINE_STEP_S = 0.002
+"""Step of the offsets about the best one."""
 FALSE_ALARMS = 1e-3
+"""Probability that an unrelated log guides the tracking, if its support follows the rivals' distribution."""
 SAME_PX = 2.0
 """Logs whose predicted tile positions differ by less (rms) count as the same."""
 MIN_RIVALS = 20
+"""Fewest rivals, of at most 47, from which mean and deviation of the supports are taken."""
 BLOCK_PAIRS, BLOCK_SIGMA, LEAST_BLOCKS = 4, 2.0, 0.75
 """LEAST_BLOCKS of the blocks of BLOCK_PAIRS pairs must each support the gyroscope by BLOCK_SIGMA standard deviations of
 its rivals: a short part of a log may fit by chance, or be the only part of this recording."""
 GUMBEL_MEAN, GUMBEL_STD = 0.5772, 1.2825
+"""Of the standard Gumbel distribution: Euler's constant and π / √6."""
 
 
 def find_guide(capture: Capture, profile: CameraProfile, gray: Reader, frames: Sequence[int]) -> GyroGuide | None:
@@ -113,9 +117,9 @@ def _rotates_enough(frames: Sequence[Frame], capture: Capture, profile: CameraPr
 class _Scores:
     """Match scores of the first frames' tiles with the second frames, at every shift."""
 
-    first: NDArray[np.intp]
+    first: Index
     """(p,) movie index."""
-    second: NDArray[np.intp]
+    second: Index
     values: NDArray[np.float32]
     """(p, tiles, 2 r + 3, 2 r + 3) correlation at shifts (y, x) from -r - 1; 0 out of reach and for flat tiles."""
     centres_px: Array

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
 from virest.inference.robust import CAUCHY
 from virest.inference.track_fit import TrackFit, fit_tracks, for_table
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:

@@ -15,7 +15,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import RowClock
-from virest.inference.frame_rotations import FrameRotations, picture_turns
+from virest.inference.frame_rotations import FrameRotations, picture_rotation
 from virest.inference.track_noise import step_noise_px
 from virest.inference.tracking import TrackPair
 
@@ -56,7 +56,8 @@ class ObservedTracks:
         clock = RowClock(profile)
         middle = clock.camera_time_s(clock.middle_s(self.stamp_s, self.exposure_s))
         first, second = ([getattr(pair, name) for pair in self.pairs] for name in ("first", "second"))
-        return picture_turns(self.lens, self.pairs, middle[first], middle[second])
+        vectors = np.array([picture_rotation(self.lens, pair) for pair in self.pairs]).reshape(-1, 3)
+        return FrameRotations(middle[first], middle[second], vectors)
 
     def chosen(self, use: NDArray[np.bool_]) -> ObservedTracks:
         """Some of the pairs."""
@@ -115,7 +116,7 @@ class ObservedTracks:
     def table(self, max_points: int) -> TrackTable:
         """All points in one table, evenly thinned to about max_points."""
         stride = max(-(-self.tracks // max_points), 1)
-        pairs = [_thinned(pair, k % stride, stride) for k, pair in enumerate(self.pairs)]
+        pairs = [_selected(pair, slice(k % stride, None, stride)) for k, pair in enumerate(self.pairs)]
         table = track_table(pairs, self.stamp_s, self.exposure_s, self.noise_px, self._windows())
         return replace(table, bits_per_px=self.bits_per_px)
 
@@ -157,22 +158,8 @@ def guessed_lens(profile: CameraProfile) -> Intrinsics:
     return profile.lens_of(GUESSED_FOCAL * max(profile.width, profile.height))
 
 
-def _selected(pair: TrackPair, use: NDArray[np.bool_]) -> TrackPair:
-    return replace(
-        pair,
-        points_first_px=pair.points_first_px[use],
-        points_second_px=pair.points_second_px[use],
-        forward_backward_px=None,
-    )
-
-
-def _thinned(pair: TrackPair, start: int, stride: int) -> TrackPair:
-    return replace(
-        pair,
-        points_first_px=pair.points_first_px[start::stride],
-        points_second_px=pair.points_second_px[start::stride],
-        forward_backward_px=None,
-    )
+def _selected(pair: TrackPair, rows: NDArray[np.bool_] | slice) -> TrackPair:
+    return replace(pair, points_first_px=pair.points_first_px[rows], points_second_px=pair.points_second_px[rows])
 
 
 def track_table(

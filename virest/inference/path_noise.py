@@ -9,15 +9,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.kalibr import measure_imu_noise
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, predict
 from virest.motion.displacement import integrate_accelerometer
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
 DRAWS = 16
 """A standard deviation from this many draws is known to 18 %."""
 

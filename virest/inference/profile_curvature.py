@@ -11,12 +11,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.inference.descent import Slopes
 from virest.inference.track_evidence import TrackEvidence, TrackSystem
 
-Array = NDArray[np.float64]
 STEP = 2.0
 """Half the distance of the two values, in Gauss-Newton standard deviations: about one true one."""
 LEAST_CURVATURE = 0.02

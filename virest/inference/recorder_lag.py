@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.join import median_period_s
@@ -14,7 +13,6 @@ from virest.capture.records import Capture
 from virest.inference.coarse_alignment import align_coarsely
 from virest.inference.observed_tracks import ObservedTracks
 
-Array = NDArray[np.float64]
 EXTRA_PERIODS = (0.0, 0.5, 1.0, 1.5, 2.0)
 """Further frame periods of lag to try if the recording ends before repeats have used it up."""
 MOST_DISAGREEMENT = 0.7

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.records import STALL, Capture
 from virest.image_formation.row_clock import RowClock
@@ -23,13 +24,14 @@ from virest.inference.tracking import TrackPair, track_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 CONTEXT = 8
 """Frames with correct timestamps on both sides of a stall, which determine the scatter of the rotations."""
 MIN_CONTEXT = 6
+"""Fewest of these whose rotations could be measured."""
 REPEAT_PX, MOVED_PX = 0.1, 0.5
 """A frame repeats its predecessor if points move less than REPEAT_PX where the gyroscope predicts over MOVED_PX."""
 LEAST_NOISE_PX = 0.1
+"""Least scatter of the rotations that is assumed, px at the focal length."""
 DECISIVE_CHI2 = 37.0
 """Smallest chi-square advantage of the best position over any other: exp(−37 / 2) is 1e-8, and 1e-6 if rotations
 scatter 15 % more than in the neighbouring frames."""

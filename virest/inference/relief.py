@@ -15,18 +15,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from virest.arrays import Array, Index, Mask
 from virest.image_formation.point_model import SMALLEST_DEPTH
 from virest.inference.depth import NEAR_S, OUTSIDE, Sightings
 from virest.inference.robust import CAUCHY
+from virest.inference.time_blocks import evenly_chosen
 from virest.motion.optics import MovingLens
 from virest.motion.relief_surface import Relief, angles
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 LONG_CELLS, SHORT_CELLS = 24, 18
 """Cells along the picture's longer and shorter side."""
 ENOUGH_POINTS, MOST_POINTS, NEARBY = 500, 1500, 1 / 32
@@ -55,6 +54,7 @@ REWEIGHTINGS = 1
 STD_STEP = 6
 """Standard deviations are computed at every such node."""
 JUDGED_INSTANTS, MIN_JUDGED_CELLS = 4, 12
+"""Frames at which a surface is judged, and fewest cells with points in them."""
 LEAST_SIGMA, LEAST_GAIN = 3.0, 0.1
 """A surface must reduce the residuals of held-out points by this many standard errors and by this fraction."""
 
@@ -117,7 +117,7 @@ def measure_roughness(sights: Sightings, grid: Grid) -> Roughness | None:
     precise = variance < MOST_STD_RATIO**2 * np.median(variance)
     edges = grid.extent * np.geomspace(FINEST_LAG, WIDEST_LAG, LAGS)
     total, count = np.zeros((2, LAGS - 1)), np.zeros(LAGS - 1)
-    for pair in _evenly_chosen(np.unique(sights.pair), COMPARED_PAIRS):
+    for pair in evenly_chosen(np.unique(sights.pair), COMPARED_PAIRS):
         mine = np.flatnonzero(precise & (sights.pair == pair))
         first, second = (mine[k] for k in np.triu_indices(len(mine), 1))
         lag = np.searchsorted(edges, np.linalg.norm(place[first] - place[second], axis=-1)) - 1
@@ -192,7 +192,7 @@ class PointsInFrame:
     variance: Array
     """(n,) from tracking noise, and from possible occlusion of points seen from another position."""
 
-    def chosen(self, use: NDArray[np.bool_]) -> PointsInFrame:
+    def chosen(self, use: Mask) -> PointsInFrame:
         """Some of the points."""
         return PointsInFrame(self.place[use], self.above_per_m[use], self.variance[use])
 
@@ -220,7 +220,7 @@ def points_in_frame(sights: Sightings, view: View, prior: ReliefPrior) -> Points
 
 
 def _seen_nearby(sights: Sightings, view: View, prior: ReliefPrior) -> Index:
-    """Indices of the points seen from nearby, chosen by pairs of frames, nearest first.
+    """Index of the points seen from nearby, chosen by pairs of frames, nearest first.
 
     Takes pairs until there are ENOUGH_POINTS, and further ones whose parallax of the sill is below NEARBY.
     """
@@ -359,7 +359,7 @@ def surface_gain(frames: list[PointsInFrame], prior: ReliefPrior) -> tuple[float
     return float(gain.sum() / max(before.sum(), 1e-30)), float(gain.sum()) / max(error, 1e-30)
 
 
-def _cells(place: Array, grid: Grid) -> tuple[Index, NDArray[np.bool_]]:
+def _cells(place: Array, grid: Grid) -> tuple[Index, Mask]:
     """Number of each position's cell, and its colour on a chessboard."""
     position = np.clip((place - grid.low) / grid.cell, 0.0, np.array([grid.columns, grid.rows]) - 1.000001)
     x, y = position.astype(np.intp).T
@@ -391,7 +391,7 @@ def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) ->
     if rough is None or not rough.sill_per_m > 0:
         return None
     priors = [relief_prior(rough, grid, stiffness) for stiffness in STIFFNESSES]
-    chosen = _evenly_chosen(np.unique(sights.pair), JUDGED_INSTANTS)
+    chosen = evenly_chosen(np.unique(sights.pair), JUDGED_INSTANTS)
     instants = [float(np.median(sights.points.time_s[sights.pair == pair])) for pair in chosen]
     frames = [points_in_frame(sights, view(instant), priors[0]) for instant in instants]
     gains = [surface_gain(frames, prior) for prior in priors]
@@ -400,8 +400,3 @@ def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) ->
     text = "relief %s, stiffness %s: held-out residuals %.0f %% smaller, %.1f standard errors"
     log.debug(text, rough, STIFFNESSES[best], 100 * gain, sigma)
     return WindowRelief(sights, priors[best]) if gain > LEAST_GAIN and sigma > LEAST_SIGMA else None
-
-
-def _evenly_chosen(values: Index, count: int) -> Index:
-    """At most ``count`` of the values, spread evenly."""
-    return values[np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).astype(int))]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from virest.arrays import Array
+
 CAUCHY = 2.4
 """Standard deviations at which the weight is 0.5: 95 % efficient for normal errors (Holland & Welsch 1977,
 doi:10.1080/03610927708827533)."""

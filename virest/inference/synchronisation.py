@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
@@ -25,14 +25,16 @@ from virest.inference.tracking_bias import bias_std
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import settling_time_s
 
-Array = NDArray[np.float64]
 POINTS = 2500
 """Most tracked points used in the fit; more are thinned evenly."""
 IMU_MARGIN_S = 0.5
+"""Samples beyond the first and the last row that a fit keeps; half or twice changes the offset by less than 0.001 σ."""
 TRANSLATION_RATIO = 1.25
 """The camera translates if residuals are this much larger in all directions than across the best parallax."""
 MAX_STD_S = 0.02
+"""Largest standard deviation of an offset that is used: 0.6 of a frame's period at 30 frames per second."""
 UNKNOWN_EXPOSURE_STD_S = 0.008
+"""Half of an unknown exposure, in the mean of 0 to 1/30 s."""
 UNKNOWN_READOUT_STD_S = 0.003
 """Smallest standard deviation of a fitted readout, since lens and parallax also shear the picture."""
 MAX_FOCAL_RESIDUAL = 1.5
@@ -40,8 +42,11 @@ MAX_FOCAL_RESIDUAL = 1.5
 0.1 of the motion makes it 8 to 9 % too short and leaves residuals of 3.5 to 1.7 at 0.1 to 0.2 px of noise; a principal
 point 9 px off leaves 1.15 to 1.4, with focal errors below 0.1 % (tracks from three analytic motions)."""
 MAX_FOCAL_SPREAD = 0.25
+"""Largest relative standard deviation of a focal length that is reported."""
 DRIFT_SIGMA, LEAST_DRIFT = 4.0, 5e-4
+"""A drift is noted above both: this many standard deviations (false-alarm probability 6e-5) and seconds per second."""
 NEAR_S = 0.01
+"""What the gyroscope explains at a fitted offset is read within this of it: 2.5 steps of the search."""
 FOREIGN_BIAS = 4.0
 """A bias further from the profile's than this many prior σ absorbs an unmodelled scene, lens or axis map."""
 AGREEMENT_SLACK_S = 0.03

@@ -6,12 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.image_formation.point_model import TrackTable
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+from virest.arrays import Array, Index, Mask
 
 
 def even_blocks(number: Index, total: int, blocks: int) -> Index:
@@ -31,3 +28,8 @@ def halves(block: Index) -> tuple[Mask, Mask]:
     """Masks (n,) of the data of two fits, alternating blocks; each fit is tested on the other's data."""
     even = block % 2 == 0
     return even, ~even
+
+
+def evenly_chosen(values: Index, count: int) -> Index:
+    """At most ``count`` of the values, spread evenly."""
+    return values[np.unique(np.linspace(0, len(values) - 1, min(count, len(values))).astype(int))]

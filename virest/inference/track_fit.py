@@ -35,17 +35,6 @@ from virest.inference.track_evidence import (
 )
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
-__all__ = [
-    "Term",
-    "TrackFit",
-    "fit_directed",
-    "fit_tracks",
-    "for_table",
-    "many_directions",
-    "one_direction",
-    "start_scene",
-]
-
 Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.81
 MIN_BLOCKS = 4

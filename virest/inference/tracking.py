@@ -89,8 +89,6 @@ class TrackPair:
     """(n, 2)."""
     points_second_px: Array
     """(n, 2), the same points."""
-    forward_backward_px: Array | None = None
-    """(n,) distance between a point and its position after tracking forwards and back."""
     guided: bool = False
     """Whether a guide warped the first picture and made both pictures equally blurred before matching."""
 
@@ -230,17 +228,16 @@ def _track(
         return TrackPair(index, index + 1, np.zeros((0, 2)), np.zeros((0, 2)))
     between = None if guide is None else guide.seen_before(index, index + 1, first.shape, factor)
     if between is None:
-        ahead, good, distance = _there_and_back(first, second, start, settings, settings.pyramid_levels)
+        ahead, good = _there_and_back(first, second, start, settings, settings.pyramid_levels)
     else:
-        ahead, good, distance = _guided(first, second, start, settings, between)
-    returned_px = distance[good].astype(float) * factor
+        ahead, good = _guided(first, second, start, settings, between)
     points_px = _stored(start[good], factor), _stored(ahead[good], factor)
-    return TrackPair(index, index + 1, *points_px, returned_px, guided=between is not None)
+    return TrackPair(index, index + 1, *points_px, guided=between is not None)
 
 
 def _guided(
     first: Picture, second: Picture, start: Points, settings: TrackingSettings, between: Between
-) -> tuple[Points, NDArray[np.bool_], NDArray[np.float32]]:
+) -> tuple[Points, NDArray[np.bool_]]:
     """Track points from their predicted positions; points not found there are tracked without the guide.
 
     The first picture is warped into the second, rotation and shear included, before matching.  A point found far from
@@ -248,7 +245,7 @@ def _guided(
     """
     predicted = np.clip(between.second_of(start.astype(float)), -OUTSIDE_PX, OUTSIDE_PX).astype(np.float32)
     warped, blurred = between.warped(first), between.blurred(second)
-    ahead, good, distance = predicted.copy(), np.zeros(len(predicted), bool), np.zeros(len(predicted), np.float32)
+    ahead, good = predicted.copy(), np.zeros(len(predicted), bool)
     guided, plain = (
         (warped, blurred, predicted, settings.guided_levels),
         (first, second, start, settings.pyramid_levels),
@@ -256,12 +253,10 @@ def _guided(
     for before, after, begun, levels in (guided, plain):
         missing = np.flatnonzero(_inside(predicted, second, settings) & ~good)
         if len(missing):
-            ahead[missing], good[missing], distance[missing] = _there_and_back(
-                before, after, begun[missing], settings, levels
-            )
+            ahead[missing], good[missing] = _there_and_back(before, after, begun[missing], settings, levels)
     far = np.flatnonzero(good & (np.linalg.norm(ahead - predicted, axis=-1) > settings.repeats_from_px))
     good[far[_repeats(warped, blurred, predicted[far], ahead[far], settings)]] = False
-    return ahead, good, distance
+    return ahead, good
 
 
 def _repeats(
@@ -292,13 +287,13 @@ def _patches(picture: Picture, points: Points, side: int) -> NDArray[np.float32]
 
 def _there_and_back(
     first: Picture, second: Picture, start: Points, settings: TrackingSettings, levels: int
-) -> tuple[Points, NDArray[np.bool_], NDArray[np.float32]]:
-    """Found positions (n, 2) of points, mask of the accepted ones (n,), and forward-backward distances (n,)."""
+) -> tuple[Points, NDArray[np.bool_]]:
+    """Found positions (n, 2) of points, and the mask (n,) of those that also lead back to their start."""
     ahead, found = _follow(first, second, start, settings, levels)
     back, returned = _follow(second, first, ahead, settings, levels)
     distance = np.linalg.norm(back - start, axis=-1)
     good = found & returned & _inside(ahead, second, settings) & (distance < settings.max_forward_backward_px)
-    return ahead, good, distance
+    return ahead, good
 
 
 def _inside(points: Points, picture: Picture, settings: TrackingSettings) -> NDArray[np.bool_]:

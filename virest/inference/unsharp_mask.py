@@ -23,18 +23,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
+from virest.arrays import Array, Picture
 from virest.image_formation.kernels import blur_chords
 from virest.image_formation.row_motion import RowMotion
 from virest.inference.chance import normal_tail
-from virest.inference.edges import EdgeSettings, find_edges, parallel_profiles
+from virest.inference.edges import EdgeSettings, find_edges, moved_profiles, parallel_profiles
 from virest.inference.robust import robust_std
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 RADIUS_PX, RADIUS_SPREAD = 1.2, 0.3
 """Prior mean and standard deviation (of the logarithm) of the radius of phones' unsharp masks: 0.9 to 1.6 px."""
@@ -215,15 +212,7 @@ def _beside_plateau(levels: Array) -> Array:
     before, after = part[rows, last], part[rows, last + 1]
     middle = ALONG_PX[last] + (ALONG_PX[1] - ALONG_PX[0]) * (0.5 - before) / (after - before)
     centred = np.abs(middle) < MAX_OFF_PX
-    return _moved(part[centred], middle[centred])
-
-
-def _moved(part: Array, middle: Array) -> Array:
-    """Profiles with their middles at 0, on GRID_PX, linear between samples."""
-    at = (GRID_PX + middle[:, None] - ALONG_PX[0]) / (ALONG_PX[1] - ALONG_PX[0])
-    index = np.clip(at.astype(np.intp), 0, len(ALONG_PX) - 2)
-    rows = np.arange(len(part))[:, None]
-    return np.asarray(part[rows, index] * (1 - (at - index)) + part[rows, index + 1] * (at - index))
+    return moved_profiles(part[centred], middle[centred], ALONG_PX, GRID_PX)
 
 
 def _inner_width(profiles: Array) -> Array:
@@ -236,16 +225,11 @@ def _inner_width(profiles: Array) -> Array:
     return np.where(after > 0, width, np.inf)
 
 
-def _crest(profiles: Array) -> tuple[int, float]:
-    """Index on GRID_PX of the highest median beyond the edge, and its height."""
-    median = np.median(profiles, axis=0)
-    at = int(np.argmax(np.where(GRID_PX > 0, median, 0.0)))
-    return at, float(median[at])
-
-
 def _overshoot(profiles: Array, bare_std: float) -> tuple[float, float]:
     """Overshoot of profiles and its standard deviation; bare_std: that of unsharpened movies alone."""
-    at, crest = _crest(profiles)
+    median = np.median(profiles, axis=0)
+    at = int(np.argmax(np.where(GRID_PX > 0, median, 0.0)))
+    crest = float(median[at])
     typical = robust_std(profiles[:, at] - crest)
     noise = MEDIAN_STD * typical / np.sqrt(len(profiles) / EDGES_PER_SAMPLE)
     return crest - 1, float(np.hypot(noise, bare_std))

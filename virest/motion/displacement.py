@@ -9,14 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
+from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 MIN_FINITE = 0.98
 """Smallest fraction of the rows with an acceleration; gaps are interpolated."""
 
@@ -32,7 +31,7 @@ class Displacement:
     arm_cam_m: Array
     """(3,) the IMU's origin in camera axes."""
 
-    def at(self, time_s: Array, origin_s: Array, window: NDArray[np.intp] | None = None) -> tuple[Array, Array, Array]:
+    def at(self, time_s: Array, origin_s: Array, window: Index | None = None) -> tuple[Array, Array, Array]:
         """P (n, 3), B (n, 3, 3) and the change per delay (n, 3), all from rest at origin_s (w,) of each window.
 
         window: (n,) window of each time; None: each time has its own.

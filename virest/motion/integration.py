@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import FORCES, RATES
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.motion.measured_rate import MeasuredRate, measured_rate
 from virest.motion.trajectory import Trajectory, rotation_from_vector, turned_angle
-
-Array = NDArray[np.float64]
 
 
 def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRate | None = None) -> Trajectory:

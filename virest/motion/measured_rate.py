@@ -16,18 +16,17 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dct, idct
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.special import gammainccinv
 
+from virest.arrays import Array, Index
 from virest.camera.gyro_filter import delay_s
 from virest.capture.imu import ImuSamples
 from virest.capture.join import GAP_PERIODS
 from virest.errors import ImuError
 
-Array = NDArray[np.float64]
 LEAST_RUN = 32
 """Shorter runs of samples are not denoised."""
 NOISE_BAND = 0.75
@@ -95,7 +94,7 @@ def without_noise(samples: Array) -> Array:
     return np.asarray(idct(kept * amplitude, axis=0, norm="ortho"))
 
 
-def _runs(time_s: Array) -> list[NDArray[np.intp]]:
+def _runs(time_s: Array) -> list[Index]:
     """Runs of samples without gaps."""
     step = np.diff(time_s)
     return np.split(np.arange(len(time_s)), np.flatnonzero(step > GAP_PERIODS * np.median(step)) + 1)

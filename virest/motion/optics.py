@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import Field
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.motion.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 SHIFT_STEP_S = 5e-4
 """Step of the stabiliser's path: at 50 rad/s² linear interpolation errs by 1.6e-6 rad."""
 SETTLED = 16.0

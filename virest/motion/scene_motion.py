@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from virest.arrays import Array, Index
+
 VELOCITY_STD_M_S = 1.0
 GRAVITY_STD_M_S2 = 0.6
 ACCEL_BIAS_STD_M_S2 = 0.15
@@ -106,7 +106,7 @@ class DirectedMotion:
         """None."""
         return np.zeros(0)
 
-    def group(self, pair: NDArray[np.intp]) -> NDArray[np.intp]:
+    def group(self, pair: Index) -> Index:
         """(n,) index of each pair's direction."""
         return np.zeros_like(pair) if len(self.direction) == 1 else pair
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from virest.arrays import Array, Index
+
 _SMALL_SQUARE = 0.01
 """rad²: below, the series of sine and cosine to the fifth term are exact to rounding, 0.01⁵ / 11! = 3e-18."""
 
@@ -64,7 +64,7 @@ class Trajectory:
         both = angle + bend + 0.5 * _cross(angle, bend)
         return Orientations(self.rotation_world_cam.take(interval, axis=0), _exponential(*both))
 
-    def _locate(self, time_s: Array) -> tuple[NDArray[np.intp], Array]:
+    def _locate(self, time_s: Array) -> tuple[Index, Array]:
         """Interval of each time (...), and the seconds since its knot (...). Times beyond the knots are clipped."""
         held = np.clip(time_s, self.time_s[0], self.time_s[-1])
         interval = np.clip(np.searchsorted(self.time_s, held, side="right") - 1, 0, len(self.time_s) - 2)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+
+from virest.arrays import Array, Mask
 
 WIDTH, HEIGHT = 360.0, 176.0
 """Size of a chart in units of about one phone pixel, so that labels stay readable at that width."""
@@ -29,7 +30,6 @@ ARROW_REACH = 0.9
 HEAD_RAD, HEAD_PART, HEAD_MAX = 0.45, 0.4, 0.016
 """Half the opening of an arrow's head, its length as a part of the arrow, and at most of the picture's diagonal."""
 
-Array = NDArray[np.float64]
 Values = Sequence[float | None]
 
 
@@ -216,7 +216,7 @@ def arrow_field(
     )
 
 
-def _thinned_tiles(centres_px: Array) -> NDArray[np.bool_]:
+def _thinned_tiles(centres_px: Array) -> Mask:
     """Every k-th row and column of tiles, so that at most MAX_ARROWS are left."""
     columns = np.unique(centres_px[:, 0], return_inverse=True)[1] if len(centres_px) else np.zeros(0, int)
     rows = np.unique(centres_px[:, 1], return_inverse=True)[1] if len(centres_px) else np.zeros(0, int)

@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Picture
 from virest.report.figures import as_file, canvas
 from virest.restoration.parameters import TileBlur
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 KERNEL_IN = 1.15
 """Side of a kernel in the figure, inches."""
 
 
-def strip_figure(pictures: Sequence[tuple[str, Picture]], title: str = "", image_format: str = "png") -> bytes:
+def strip_figure(pictures: Sequence[tuple[str, Picture]]) -> bytes:
     """Pictures (h, w, 3) of one size side by side, each labelled, at one figure pixel per picture pixel."""
     height, width = pictures[0][1].shape[:2]
     figure = canvas(width * len(pictures) / 110 + 0.2, height / 110 + 0.4)
@@ -25,9 +24,7 @@ def strip_figure(pictures: Sequence[tuple[str, Picture]], title: str = "", image
         axes.imshow(picture, cmap="gray", interpolation="antialiased")
         axes.set_title(name, fontsize=10)
         axes.set_axis_off()
-    if title:
-        figure.suptitle(title)
-    return as_file(figure, image_format)
+    return as_file(figure, "png")
 
 
 def blur_figure(
@@ -94,7 +91,7 @@ def axes_figure() -> bytes:
 
 
 def _draw_picture_axes(axes: Any) -> None:
-    axes.add_patch(_rectangle(0, 0, 4, 3))
+    axes.add_patch(_rectangle(4, 3))
     _arrow(axes, (0, 0), (1.6, 0), "x: u, right", "crimson", (0.1, -0.18))
     _arrow(axes, (0, 0), (0, 1.6), "y: v, down", "seagreen", (0.1, 0.1))
     axes.text(0.12, 0.42, "(0, 0) is the centre of\nthe top-left pixel", fontsize=7)
@@ -106,7 +103,7 @@ def _draw_picture_axes(axes: Any) -> None:
 
 
 def _draw_phone_axes(axes: Any) -> None:
-    axes.add_patch(_rectangle(0, 0, 1.8, 3.4))
+    axes.add_patch(_rectangle(1.8, 3.4))
     _arrow(axes, (0.9, 1.7), (2.3, 1.7), "x IMU = x camera", "crimson", (0.05, -0.12))
     _arrow(axes, (0.9, 1.7), (0.9, 0.1), "y IMU", "seagreen", (0.08, 0.3))
     _arrow(axes, (0.9, 1.7), (0.9, 3.1), "y camera", "darkorange", (0.03, 0.2))
@@ -114,10 +111,10 @@ def _draw_phone_axes(axes: Any) -> None:
     _frame(axes, (-0.6, 4.0), (3.9, -0.5), "Android phone, upright: T_cam_imu = diag(1, −1, −1)")
 
 
-def _rectangle(x: float, y: float, width: float, height: float) -> Any:
+def _rectangle(width: float, height: float) -> Any:
     from matplotlib.patches import Rectangle
 
-    return Rectangle((x, y), width, height, fill=False, edgecolor="0.4", lw=1.2)
+    return Rectangle((0, 0), width, height, fill=False, edgecolor="0.4", lw=1.2)
 
 
 def _arrow(

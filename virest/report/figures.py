@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask, Picture
 from virest.calibration.response_curve import CurveFit
 from virest.capture.pixels import BT601_LUMA
 from virest.effects.records import PHOTOMETRY
@@ -31,8 +31,6 @@ LEAST_BARS = 3
 MOST_DEVIATIONS, DEVIATION_BARS = 4.0, 16
 """A normal error beyond 4 σ is one of 16 000; bars are half a σ wide."""
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 RungBars = tuple[str, float, Mapping[str, float], str | None]
 
 
@@ -231,8 +229,8 @@ def _draw_rung(axes: Any, rung: RungBars, most: int, name: str) -> None:
         axes.set_title(literal(name), fontsize=10, pad=18)
 
 
-def equal_bins(along: Array, known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """Indices of the known points in bins of equal count along the covariate; empty with too few points for a bin."""
+def equal_bins(along: Array, known: Mask) -> list[Index]:
+    """Index of the known points in bins of equal count along the covariate; empty with too few points for a bin."""
     numbers = np.flatnonzero(known)
     if len(numbers) < MIN_IN_BIN:
         return []

@@ -19,8 +19,8 @@ import cv2
 import jinja2
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
+from virest.arrays import Picture
 from virest.capture.join import consecutive_runs
 from virest.report.charts import ArrowField, Chart, Stretch, arrow_field, band, time_chart
 from virest.report.words import (
@@ -53,7 +53,6 @@ STATE_WORDS = {
 }
 LEFT_ALONE = ("failed", "skipped", "copied", "straightened", "remark")
 """States listed in the table of reasons, in this order."""
-Picture = NDArray[np.uint8]
 
 
 # ── data of the page ─────────────────────────────────────────────────────────────────────────────────────────────

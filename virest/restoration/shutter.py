@@ -34,7 +34,7 @@ def rowwise_map(motion: RowMotion, anchor: float, *, undistort: bool = False) ->
 
     def recorded(points: NDArray[np.float64]) -> NDArray[np.float64]:
         shown = distorted_points(motion.optics, points, motion.reference_s)
-        return seen_by_rows(motion, shown, motion.reference_s, anchor, None, PIXELS_WITHIN_PX)
+        return seen_by_rows(motion, shown, motion.reference_s, anchor, PIXELS_WITHIN_PX)
 
     return grid_filled(motion, recorded, _lens_spacing_px(motion))
 

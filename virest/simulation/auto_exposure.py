@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.errors import SettingsError
 
-Array = NDArray[np.float64]
 NOMINAL_ISO = 144
 LOWEST_ISO = 50
 """ISO without auto-exposure, and the lowest of a phone's sensor."""

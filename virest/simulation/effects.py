@@ -16,7 +16,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.effects.table import EFFECTS as TABLE
 from virest.errors import SettingsError
 from virest.simulation.phone_isp import OFF, PhoneIsp
@@ -144,22 +143,10 @@ def _between(context: EffectContext, low: float, high: float) -> float:
     return round(float(context.rng.uniform(low, high)), 6)
 
 
-def _shutter(profile: CameraProfile, **changes: Any) -> CameraProfile:
-    return replace(profile, shutter=replace(profile.shutter, **changes))
-
-
-def _extend(profile: CameraProfile, **changes: Any) -> CameraProfile:
-    return replace(profile, extensions=replace(profile.extensions, **changes))
-
-
 def _lens(profile: CameraProfile, **changes: Any) -> CameraProfile:
     if profile.intrinsics is None:
         raise SettingsError("this effect needs a profile with intrinsics", hint="set intrinsics.fx_px")
     return replace(profile, intrinsics=replace(profile.intrinsics, **changes))
-
-
-def _curve(profile: CameraProfile, **changes: Any) -> CameraProfile:
-    return replace(profile, response=replace(profile.response or ResponseCurve("srgb"), **changes))
 
 
 def _rotate_imu(profile: CameraProfile, values: list[float]) -> CameraProfile:
@@ -215,7 +202,7 @@ def _gain_walk(context: EffectContext, rms: float) -> list[float]:
 def _replace_gain(profile: CameraProfile, values: list[float]) -> CameraProfile:
     if any(v <= 0 for v in values):
         raise SettingsError("effect gain_drift: gains must be positive", hint="a list with one factor per frame")
-    return _extend(profile, gain=tuple(values))
+    return profile.with_extensions(gain=tuple(values))
 
 
 _BY_NAME: dict[str, Effect] = {
@@ -229,21 +216,21 @@ _BY_NAME: dict[str, Effect] = {
     ),
     "readout_time": Effect(
         lambda p, c: [round(p.shutter.readout_time_s * (1 + _signed(c, 0.15, 0.3)), 6)],
-        lambda p, v: _shutter(p, readout_time_s=v[0]),
+        lambda p, v: p.with_shutter(readout_time_s=v[0]),
     ),
     "readout_direction": Effect(
         lambda p, c: [OPPOSITE[p.shutter.readout_direction]],
-        lambda p, v: _shutter(p, readout_direction=v[0]),
+        lambda p, v: p.with_shutter(readout_direction=v[0]),
         words=DIRECTIONS,
     ),
     "timestamp_reference": Effect(
         lambda p, c: [str(c.rng.choice([s for s in STAMPS if s != p.shutter.timestamp]))],
-        lambda p, v: _shutter(p, timestamp=v[0]),
+        lambda p, v: p.with_shutter(timestamp=v[0]),
         words=STAMPS,
     ),
     "exposure_time": Effect(
         lambda p, c: [round(float(np.exp(_signed(c, 0.25, 0.45))), 4)],
-        lambda p, v: _shutter(p, exposure_scale=p.shutter.exposure_scale * v[0]),
+        lambda p, v: p.with_shutter(exposure_scale=p.shutter.exposure_scale * v[0]),
     ),
     "gyro_bias": Effect(
         lambda p, c: [_signed(c, 0.02, 0.06) for _ in range(3)],
@@ -255,14 +242,14 @@ _BY_NAME: dict[str, Effect] = {
     ),
     "gyro_lowpass": Effect(
         lambda p, c: [_between(c, 8.0, 20.0)],
-        lambda p, v: _extend(p, gyro_lowpass_hz=v[0]),
+        lambda p, v: p.with_extensions(gyro_lowpass_hz=v[0]),
     ),
     "imu_rotation": Effect(lambda p, c: [_signed(c, 0.015, 0.04) for _ in range(3)], _rotate_imu),
     "focal_length": Effect(lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)], _scale_focal),
     "pixel_aspect": Effect(lambda p, c: [round(1 + _signed(c, 0.02, 0.05), 6)], _stretch_pixels),
     "focal_drift": Effect(
         lambda p, c: [_signed(c, 0.01, 0.03)],
-        lambda p, v: _extend(p, focal_drift_per_s=v[0]),
+        lambda p, v: p.with_extensions(focal_drift_per_s=v[0]),
     ),
     "radial_distortion": Effect(lambda p, c: [_signed(c, 0.04, 0.1)], _bend_radially),
     "principal_point": Effect(
@@ -271,7 +258,7 @@ _BY_NAME: dict[str, Effect] = {
     ),
     "stabilisation": Effect(
         lambda p, c: [_between(c, 0.4, 0.8), _between(c, 0.5, 1.5)],
-        lambda p, v: _extend(p, stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1]),
+        lambda p, v: p.with_extensions(stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1]),
         optional=1,
     ),
     "scene_depth": Effect(
@@ -279,22 +266,24 @@ _BY_NAME: dict[str, Effect] = {
     ),
     "frame_lag": Effect(
         _draw_frame_lag,
-        lambda p, v: _extend(p, frame_lag_s=v[0], frame_lag_frames=int(v[1])),
+        lambda p, v: p.with_extensions(frame_lag_s=v[0], frame_lag_frames=int(v[1])),
         optional=1,
     ),
     "response_curve": Effect(
         lambda p, c: [round(float(np.exp(_signed(c, 0.15, 0.3))), 4)],
-        lambda p, v: _curve(p, extra_gamma=v[0]),
+        lambda p, v: p.with_curve(extra_gamma=v[0]),
     ),
-    "black_level": Effect(lambda p, c: [_between(c, 0.03, 0.08)], lambda p, v: _curve(p, black_level=v[0])),
-    "vignetting": Effect(lambda p, c: [_between(c, 0.3, 0.6)], lambda p, v: _extend(p, vignetting_corner_loss=v[0])),
+    "black_level": Effect(lambda p, c: [_between(c, 0.03, 0.08)], lambda p, v: p.with_curve(black_level=v[0])),
+    "vignetting": Effect(
+        lambda p, c: [_between(c, 0.3, 0.6)], lambda p, v: p.with_extensions(vignetting_corner_loss=v[0])
+    ),
     "flicker": Effect(
         lambda p, c: [_between(c, 0.15, 0.4), float(c.rng.choice([100.0, 120.0])), _between(c, 0, 6.28)],
-        lambda p, v: _extend(p, flicker_amplitude=v[0], flicker_frequency_hz=v[1], flicker_phase_rad=v[2]),
+        lambda p, v: p.with_extensions(flicker_amplitude=v[0], flicker_frequency_hz=v[1], flicker_phase_rad=v[2]),
         optional=2,
     ),
     "gain_drift": Effect(lambda p, c: _gain_walk(c, 0.12), _replace_gain, per_frame=True),
-    "defocus": Effect(lambda p, c: [_between(c, 1.0, 2.0)], lambda p, v: _extend(p, defocus_sigma_px=v[0])),
+    "defocus": Effect(lambda p, c: [_between(c, 1.0, 2.0)], lambda p, v: p.with_extensions(defocus_sigma_px=v[0])),
     "sharpening": Effect(
         lambda p, c: [_between(c, 0.7, 1.2), _between(c, 1.0, 1.8)],
         lambda p, v: p,

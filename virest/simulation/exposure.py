@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.errors import SettingsError
@@ -22,7 +23,6 @@ from virest.simulation.hand_motion import FINE_STEP_S, HandMotion
 from virest.simulation.hidden import NOTHING, Hidden, focal_changes, focal_scale, late_rows_s, seen_radius_px
 from virest.simulation.scenes import Scene
 
-Array = NDArray[np.float64]
 Image = NDArray[Any]
 
 STEP_PX = 0.4

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from virest.arrays import Array
 
 FINE_STEP_S = 5e-4
 """Step of the simulator's fine time grids: 1/160 of the shortest period of the hand's motion, 12 Hz."""
@@ -141,19 +140,6 @@ def random_hand_motion(
     if any(walk_m):
         sway = _with_arc(sway, walk_m, duration_s)
     return integrate_motion(rate, sway, -margin_s, duration_s + margin_s, centre_on_s=(0.0, duration_s))
-
-
-def constant_motion(
-    rate_rad_s: tuple[float, float, float],
-    *,
-    start_s: float = -1.0,
-    end_s: float = 1.0,
-    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> HandMotion:
-    """Rotate at a constant rate (camera axes) and fixed position; world axes are the camera's at time 0."""
-    rate = Waves(np.zeros((3, 1)), np.array(rate_rad_s, float)[:, None], np.zeros((3, 1)))
-    sway = Waves(np.zeros((3, 1)), np.array(position_m, float)[:, None], np.zeros((3, 1)))
-    return integrate_motion(rate, sway, start_s, end_s, centre_on_s=(0.0, 0.0))
 
 
 def integrate_motion(

@@ -12,12 +12,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import FORCES, RATES
 from virest.camera.profile import CameraProfile
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, cont2discrete, lfilter, lfilter_zi, sosfilt
 
+from virest.arrays import Array
 from virest.simulation.hand_motion import FINE_STEP_S
-
-Array = NDArray[np.float64]
 
 SETTLING_PERIODS = 2.0
 """Periods of the corner frequency by which the filter starts before the first sample, settled at the first rate."""

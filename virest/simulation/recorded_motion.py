@@ -11,16 +11,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.errors import ImuError
 from virest.simulation.hand_motion import HandMotion, Waves, integrate_motion
 from virest.simulation.hidden import missing_rate_rad_s
 from virest.simulation.phone_gyro import before_low_pass
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Picture
 from virest.camera.profile_file import write_profile
 from virest.capture.join import TICKS_PER_S
 from virest.capture.pixels import BT601
@@ -35,8 +36,6 @@ from virest.simulation.session import (
     render_truth,
     sample_imu,
 )
-
-Picture = NDArray[np.uint8]
 
 LAYOUTS = ("2021", "v2.0")
 """With Unix-time columns (builds after April 2021) and without (the release tagged v2.0)."""

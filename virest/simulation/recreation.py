@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.recounting import counted_from
-from virest.camera.response import ResponseCurve
 from virest.capture.join import TICKS_PER_S
 from virest.capture.records import IMU_GAP, NO_IMU, NO_STAMP, Capture, Frame
 from virest.errors import CaptureError, SettingsError
@@ -28,8 +28,6 @@ from virest.simulation.recorded_motion import recorded_motion
 from virest.simulation.scenes import MAX_CHART_PX, Scene
 from virest.simulation.sensor import sensor_light
 from virest.simulation.session import ImuLog, Session, SessionSettings, shown_captures
-
-Array = NDArray[np.float64]
 
 NOT_RECREATABLE = frozenset({NO_IMU, IMU_GAP, NO_STAMP})
 """Skip codes of frames without a known time or motion; they cannot be recreated."""
@@ -207,7 +205,7 @@ def _scene(
 ) -> Scene:
     """Chart at infinity from the picture's light, in the viewing direction at ``seen_s``; mirrored beyond valid_px."""
     profile = view.profile
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     factor = sensor_light(np.ones((profile.height, profile.width, 1), np.float32), profile, gain, defocus=False)
     light = curve.linearise(scene.picture.astype(np.float32) / 255).astype(np.float32) / np.maximum(
         factor, _LEAST_FACTOR

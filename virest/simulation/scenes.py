@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.errors import SettingsError
 
 log = logging.getLogger(__name__)
@@ -67,10 +68,10 @@ class Scene:
 
     def chart_from_ray(
         self,
-        rotation_world_cam: NDArray[np.float64],
-        position_m: NDArray[np.float64],
-        time_s: NDArray[np.float64] | float = 0.0,
-    ) -> NDArray[np.float64]:
+        rotation_world_cam: Array,
+        position_m: Array,
+        time_s: Array | float = 0.0,
+    ) -> Array:
         """Homography from rays (x, y, 1) in camera axes to homogeneous chart pixels, for poses (..., 3, 3), (..., 3).
 
         time_s: (...,) time of each pose; it matters only if the chart moves.
@@ -91,7 +92,7 @@ class Scene:
             plane = np.stack([rows[0], rows[1], np.broadcast_to(n * self.depth_m, rows[0].shape)], axis=-2)
         return self._chart_matrix(np.asarray(time_s, float)) @ plane @ rotation
 
-    def _chart_matrix(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _chart_matrix(self, time_s: Array) -> Array:
         height, width = self.chart.shape[:2]
         focal = self.chart_focal_px
         matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
@@ -105,7 +106,7 @@ class Scene:
         """Move the chart to a plane at another depth; its angular size at the origin is unchanged."""
         return Scene(self.chart, self.chart_focal_px, depth_m, normal, self.drift_per_s)
 
-    def sample(self, homography: NDArray[np.float64], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
+    def sample(self, homography: Array, x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
         """Light along rays (x, y, 1), bilinear between chart pixels, mirrored outside: (h, w, channels)."""
         h = homography.astype(np.float32)
         weight = 1.0 / (h[2, 0] * x + (h[2, 1] * y + h[2, 2]))
@@ -133,16 +134,16 @@ class ReliefScene(Scene):
 
     def chart_from_ray(
         self,
-        rotation_world_cam: NDArray[np.float64],
-        position_m: NDArray[np.float64],
-        time_s: NDArray[np.float64] | float = 0.0,
-    ) -> NDArray[np.float64]:
+        rotation_world_cam: Array,
+        position_m: Array,
+        time_s: Array | float = 0.0,
+    ) -> Array:
         """Homographies of all planes, as :meth:`Scene.chart_from_ray`: (..., planes, 3, 3)."""
         farthest = Scene(self.chart, self.chart_focal_px, self.depth_m, self.normal, self.drift_per_s)
         planes = (farthest, *self.nearer)
         return np.stack([p.chart_from_ray(rotation_world_cam, position_m, time_s) for p in planes], axis=-3)
 
-    def sample(self, homography: NDArray[np.float64], x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
+    def sample(self, homography: Array, x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
         """Light along rays, the planes composited back to front: (h, w, 3)."""
         light = Scene.sample(self, homography[0], x, y)
         for plane, plane_homography in zip(self.nearer, homography[1:], strict=True):
@@ -370,7 +371,7 @@ def _leaf_labels(rng: np.random.Generator, width: int, height: int, scale: float
     return labels, count + 1
 
 
-def _power_radii(rng: np.random.Generator, count: int, small: float, large: float) -> NDArray[np.float64]:
+def _power_radii(rng: np.random.Generator, count: int, small: float, large: float) -> Array:
     """Radii with density ∝ r⁻³ between small and large."""
     u = rng.uniform(size=count)
     return 1.0 / np.sqrt((1 - u) / small**2 + u / large**2)
@@ -441,5 +442,5 @@ def _smooth_field(rng: np.random.Generator, width: int, height: int) -> NDArray[
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
-def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(vector: Array) -> Array:
     return vector / np.linalg.norm(vector)

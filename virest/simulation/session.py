@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from virest.arrays import Array, Picture
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import ANDROID_R_CAM_IMU, LANDSCAPE_R_CAM_IMU, CameraProfile
 from virest.camera.profile_file import require_usable
@@ -30,9 +31,6 @@ from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
 from virest.simulation.scenes import LENS_SIGMA_PX, Scene, add_moving_objects, add_near_objects, make_scene
 from virest.simulation.sensor import eight_bit, grey_of_light, noisy_levels, round_levels, sensor_light
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 GRAVITY_WORLD_M_S2 = np.array([0.0, 9.81, 0.0])
 """World y points down."""
@@ -503,8 +501,4 @@ def _gyro_noise(session: Session, shape: tuple[int, ...], rng: np.random.Generat
 
 def _grey(session: Session, light: Array) -> Array:
     """Grey in [0, 1]: highlight roll-off, then the response curve."""
-    return grey_of_light(roll_off_highlights(light, session.settings.isp.highlights), _curve(session))
-
-
-def _curve(session: Session) -> ResponseCurve:
-    return session.true.response or ResponseCurve("srgb")
+    return grey_of_light(roll_off_highlights(light, session.settings.isp.highlights), session.true.curve)

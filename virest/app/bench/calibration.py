@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from virest.app.bench.workload import Scale
 from virest.app.calibrate import plan_calibration
 from virest.app.console import numeric_table
 from virest.app.simulate import simulate_command
+from virest.arrays import Array
 from virest.calibration.calibrated_values import CalibratedValue
 from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
 from virest.camera.profile import CameraProfile
@@ -35,7 +35,6 @@ from virest.inference.robust import NORMAL_MEDIAN
 from virest.inference.tracking_bias import STILL_SHARED, STILL_SHARED_OTHER, shared_std
 from virest.report.figures import deviation_figure
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 FRAMES, QUICK_SEEDS = 90, 12
 """Three seconds, as long as the captures of the other sections; seeds of a quick run."""

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.bench.workload import Scale, simulated
 from virest.app.console import numeric_table
 from virest.app.diagnose import open_source
+from virest.arrays import Array
 from virest.camera.shutter import READOUT_DIRECTIONS
 from virest.capture.video import GrayReader
 from virest.image_formation.point_model import TrackTable, integrate_motion, predict
@@ -32,7 +32,6 @@ from virest.inference.profile_terms import FOCAL, K1, PRINCIPAL_POINT, TIME_OFFS
 from virest.inference.term import Term
 from virest.inference.track_fit import fit_tracks
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 BITS_PER_PX = (0.5, 0.2, 0.1)
 """From twice a phone's usual 0.25 bits per pixel to less than half of it."""

@@ -13,11 +13,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from virest.app.bench.workload import FINE_BITS, Picture, Scale, recorded_frames, simulated
+from virest.app.bench.workload import FINE_BITS, Scale, recorded_frames, simulated
 from virest.app.console import cell, numeric_table
 from virest.app.evaluation_captures import truth_frame
+from virest.arrays import Array, Mask, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import read_capture, resolve_profile
 from virest.evaluation.fidelity import MARGIN_PX
@@ -41,7 +41,6 @@ CURVES: dict[str, tuple[ResponseCurve, dict[str, ResponseCurve]]] = {
 """The camera's curve, and the wrong curves used for restoration."""
 CODED_PX = 8
 """Transform block size of the codec, over which coding errors spread."""
-Mask = NDArray[np.bool_]
 
 
 class UnmaskedCurve(ResponseCurve):
@@ -49,11 +48,11 @@ class UnmaskedCurve(ResponseCurve):
 
     __slots__ = ()
 
-    def censored_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
+    def censored_table(self, margin_levels: float = 0.5) -> Mask:
         """No grey level is censored."""
         return np.zeros(256, bool)
 
-    def clipped_table(self, margin_levels: float = 0.5) -> NDArray[np.bool_]:
+    def clipped_table(self, margin_levels: float = 0.5) -> Mask:
         """No grey level is clipped."""
         return np.zeros(256, bool)
 
@@ -108,7 +107,7 @@ def _capture(work: Path, name: str, **options: Any) -> Path:
     return simulated(work, name.replace(" ", "-"), **{**BASE, **options})
 
 
-def _psnrs_db(capture: Path, curve: ResponseCurve, deblur: str | None = None) -> NDArray[np.float64]:
+def _psnrs_db(capture: Path, curve: ResponseCurve, deblur: str | None = None) -> Array:
     """PSNR (frames,) of each frame inside its valid rectangle less a margin."""
     results = [(r, truth_frame(capture, r.frame.index)) for r in restored(capture, curve, deblur)]
     return np.array([masked_psnr_db(r.picture, truth, inside(r, truth.shape)) for r, truth in results])

@@ -15,9 +15,9 @@ from virest.app.bench.workload import Scale
 from virest.app.console import numeric_table
 from virest.app.diagnose import open_source
 from virest.app.simulate import simulate_command
-from virest.diagnosis.catalogue import CATALOGUE
 from virest.diagnosis.findings import CONSISTENT, Diagnosis
 from virest.diagnosis.ladder import diagnose_capture
+from virest.effects.table import EFFECTS
 
 FRAMES = 90
 """Three seconds of movie."""
@@ -30,7 +30,7 @@ Case = tuple[str, int]
 def diagnosis_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     """Diagnose one capture per effect and seed, and a quarter as many captures without effects."""
     seeds = SEEDS["quick" if scale.quick else "full" if scale.full else "normal"]
-    cases: list[Case] = [(name, 100 * k + i) for k in range(seeds) for i, name in enumerate(CATALOGUE)]
+    cases: list[Case] = [(name, 100 * k + i) for k in range(seeds) for i, name in enumerate(EFFECTS)]
     cases += [("", 9000 + k) for k in range(max(len(cases) // 4, 2))]
     rows = [diagnose_hidden(work, *case) for case in cases]
     right = [row for row in rows if row["right"]]

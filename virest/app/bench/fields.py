@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.bench.workload import Scale, run_process
 from virest.app.console import cell, numeric_table
 from virest.app.diagnose import Source, open_source
 from virest.app.evaluation_captures import truth_frame
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import write_profile
 from virest.camera.response import ResponseCurve
@@ -33,7 +33,6 @@ from virest.simulation.hidden import NOTHING, Hidden
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.session import SessionSettings, nominal_camera, plan_session
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 Draw = Callable[[np.random.Generator, float], "UnknownEffect"]
 SIZE, SMALL, FPS = (640, 480), (480, 360), 30.0

@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 from virest.app.bench.workload import Scale, Workload, honesty_workloads, simulated
 from virest.app.console import CONSOLE, numeric_table
 from virest.app.evaluation_captures import TrueCapture, open_true_capture
+from virest.arrays import Array
 from virest.evaluation.fidelity import psnr_db
 from virest.inference.robust import MEDIAN_TO_STD
 from virest.restoration.capture import RestorationPlan
@@ -30,7 +31,6 @@ from virest.restoration.settings import PRESETS
 from virest.restoration.statistics import of_picture, ring_fit
 from virest.restoration.statistics.records import Misplaced
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 OTHER_SEEDS = 1000
 """Added to the seeds of the test captures."""

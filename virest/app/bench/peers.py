@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import read_capture, resolve_profile
 from virest.evaluation.baselines import SCIKIT, Deconvolve, baseline_pictures, centre_psf, deblurred
 from virest.image_formation.row_motion import RowMotion, row_motion
 from virest.motion.integration import integrate_gyro
 
-Picture = NDArray[np.uint8]
 Plane = NDArray[np.float32]
 PEERS: dict[str, tuple[Deconvolve, tuple[float, ...]]] = {
     name: (baseline.deconvolve, baseline.settings) for name, baseline in SCIKIT.items()
@@ -31,7 +31,7 @@ def frame_motions(capture_folder: Path) -> tuple[ResponseCurve, dict[int, RowMot
     trajectory = integrate_gyro(capture.imu, profile)
     usable = [frame for frame in capture.frames if frame.skip_reason is None]
     motions = {f.index: row_motion(trajectory, profile, f.time_s, f.exposure_s) for f in usable}
-    return profile.response or ResponseCurve("srgb"), motions
+    return profile.curve, motions
 
 
 def peer_pictures(name: str, picture: Picture, motion: RowMotion, curve: ResponseCurve) -> Iterator[Picture]:

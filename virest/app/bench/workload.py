@@ -17,16 +17,15 @@ from typing import Any
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.app.evaluation_captures import read_picture
 from virest.app.simulate import simulate_command
+from virest.arrays import Picture
 from virest.capture.join import TICKS_PER_S
 from virest.capture.video import probe_movie, read_frames
 from virest.simulation.phone_isp import PhoneIsp
 from virest.simulation.recording import RecordingOptions, write_movie
 
-Picture = NDArray[np.uint8]
 PRESETS = ("fast", "balanced", "best")
 LOOP_FRAMES = 15
 """0.5 s at 30 frames/s, so that the loop's length is a whole number of microseconds."""

@@ -25,7 +25,6 @@ from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 KNOTS, FINE_KNOTS = 4, 7
 FINER_LEFT = 0.98
 """A finer map must reduce the held-out residual of the coarser one below this fraction."""
