@@ -19,7 +19,7 @@ from virest.capture.imu import ImuSamples
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.records import Distrusted
-from virest.diagnosis.field.search import with_fields
+from virest.diagnosis.field.search import is_believable, with_fields
 from virest.diagnosis.field.stretches import bridging_form, rate_walk
 from virest.diagnosis.field.sudden import best_instant
 from virest.diagnosis.field.words import finding_of
@@ -362,6 +362,12 @@ def test_nothing_hidden_has_no_field_and_no_stretch(seed: int) -> None:
     assert not fields
     assert not verdict.model.profile.fields
     assert not doubtful_stretches(phone.imu)
+
+
+@pytest.mark.parametrize(("size", "left_px", "stated"), [(0.55, 1.2, False), (0.55, 0.25, True), (0.05, 1.2, True)])
+def test_a_field_that_no_phone_has_must_explain_the_points(size: float, left_px: float, stated: bool) -> None:
+    """A zoom by half explains them; where 1.2 px are left of 0.24 px of noise, the model does not follow the frames."""
+    assert is_believable("scale", [np.array([[0.0], [size]])], left_px, 0.24) is stated
 
 
 def test_named_causes_alone_are_no_field() -> None:

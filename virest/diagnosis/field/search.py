@@ -7,7 +7,7 @@ stays if it improves held-out time blocks.  Causes that it makes redundant are t
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals, point_residuals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
-from virest.diagnosis.field.forms import OVER, FieldForm
+from virest.diagnosis.field.forms import OVER, STD, FieldForm
 from virest.diagnosis.field.records import FittedField
 from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, RIVAL_T, Design, Scored, Selection, score_forms, select
 from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
+    EXCESS_SCALE,
     FINAL_POINTS,
     LARGE_GAIN,
     MIN_GAIN,
@@ -90,7 +91,11 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         model = after.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, FINAL_POINTS))
         state = replace(after, model=replace(model, profile=fitted.profile, scene=fitted.scene))
-        typical = evidence.typical_px
+        typical, form = evidence.typical_px, after.forms[-1]
+        left_px, noise_px = capped_rms(fitted.distance) * typical, evidence.noise_px(fitted)
+        if not is_believable(form.kind, form.values(fitted.value(form.name)), left_px, noise_px):
+            log.debug("no phone has it, and it leaves %.3g px: %s", left_px, form.name)
+            break
         stability = chosen.selection.stability if chosen.selection else None
         before_px, after_px = before.rms * typical, entered.after.rms * typical
         fields = [entry for entry in fields if entry.form.name in {form.name for form in after.forms}]
@@ -110,6 +115,15 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         noise_px=evidence.noise_px(fitted),
         fields=[*found.fields, *fields],
     )
+
+
+def is_believable(kind: str, values: Iterable[Array], left_px: float, noise_px: float) -> bool:
+    """Whether a field's values are below 10 times the usual in phones, or leave the points nothing but their noise.
+
+    A model that does not follow the points at all is best improved by a field that no phone has.
+    """
+    usual = max(float(np.abs(part).max(initial=0.0)) for part in values) < STD[kind]
+    return usual or left_px < EXCESS_SCALE * noise_px
 
 
 @dataclass(frozen=True, slots=True)
