@@ -195,6 +195,22 @@ def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:
     assert np.corrcoef(found.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
 
 
+@pytest.mark.parametrize(("seed", "sway_m"), [(101, 0.1), (102, 0.25)], ids=["shaken", "at_4_g"])
+def test_a_wrong_focal_length_beside_it_keeps_its_name(seed: int, sway_m: float) -> None:
+    """A focal drift compensated for both before the field; forces beyond 2 g were taken for 2 g."""
+    wall = replace(HAND, seed=seed, sway_m=sway_m, plane_per_m=(0.05, -0.1, 0.35), accel_bias_m_s2=(0.0, 0.0, 0.0))
+    phone = StrangePhone(wall, Strange(gyro=lambda t, reading, force: reading + force @ (0.6 * PER_FORCE).T))
+    lens = phone.profile.intrinsics
+    assert lens is not None
+    shorter = replace(lens, fx_px=lens.fx_px / 1.04, fy_px=lens.fy_px / 1.04)
+    verdict, fields = judged(phone, replace(phone.profile, depth_m=None, intrinsics=shorter), rungs=1)
+    assert [entry.name for entry in verdict.accepted] == ["focal_length"]
+    assert verdict.model.profile.intrinsics is not None
+    assert verdict.model.profile.intrinsics.fx_px == pytest.approx(lens.fx_px, rel=1e-3)
+    assert [field.covariates for field in fields] == [("acceleration",)]
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+
+
 def test_a_filled_gap_is_bridged_from_the_points() -> None:
     """A straight line in the log is seen in the log, confirmed by the points, and replaced by what they tell."""
     phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=filled(1.0, 1.15)))

@@ -29,6 +29,7 @@ from virest.diagnosis.geometric_ladder import (
     MIN_GAIN,
     Accepted,
     GeometricVerdict,
+    climb_on,
     p_of,
 )
 from virest.inference.chance import beyond_noise, t_ratio
@@ -85,9 +86,11 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         if (step := next((step for step in steps if step is not None), None)) is None:
             break
         chosen, entered, after = step
-        before = entered.before
-        if len(after.accepted) < len(state.accepted):
-            before = _held_out(evidence, _without_form(after.model, after.forms[-1]), fitted)
+        before, last = entered.before, entered.after
+        after = _with_other_causes(evidence, found, after)
+        if after.accepted != state.accepted:
+            less = _without_form(after.model, after.forms[-1])
+            before, last = (_held_out(evidence, m, fitted, entered.form.local) for m in (less, after.model))
         model = after.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, FINAL_POINTS))
         state = replace(after, model=replace(model, profile=fitted.profile, scene=fitted.scene))
@@ -97,7 +100,7 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
             log.debug("no phone has it, and it leaves %.3g px: %s", left_px, form.name)
             break
         stability = chosen.selection.stability if chosen.selection else None
-        before_px, after_px = before.rms * typical, entered.after.rms * typical
+        before_px, after_px = before.rms * typical, last.rms * typical
         fields = [entry for entry in fields if entry.form.name in {form.name for form in after.forms}]
         fields.append(FittedField(entered.form, chosen.rivals, chosen.p_value, stability, before_px, after_px, fitted))
         log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
@@ -442,6 +445,21 @@ def _without_redundant_causes(evidence: Evidence, found: GeometricVerdict, state
             return state
         log.debug("stood in for a field: %s", [entry.name for entry in leaving])
         state = state.without(found, leaving)
+
+
+def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _SearchState) -> _SearchState:
+    """Add the cause that the points need beside a new field, and remove what it makes redundant.
+
+    Before the field, another cause may have compensated for both: a focal drift for a wrong focal length beside a
+    gyroscope that feels gravity.  Nothing is sought where the residuals are noise.
+    """
+    fitted = evidence.fit(state.model, state.model.terms, evidence.table(state.model, JUDGE_POINTS))
+    if fitted.scale < EXCESS_SCALE:
+        return state
+    model, accepted = climb_on(evidence, found.nominal.profile, state.model, state.accepted)
+    if len(accepted) == len(state.accepted):
+        return state
+    return _without_redundant_causes(evidence, found, replace(state, model=model, accepted=accepted))
 
 
 def _loses_without(judged: _Judged, by_point: bool, less: Model) -> bool:
