@@ -19,7 +19,7 @@ from virest.capture.imu import ImuSamples
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.records import Distrusted
-from virest.diagnosis.field.search import with_fields
+from virest.diagnosis.field.search import is_believable, with_fields
 from virest.diagnosis.field.stretches import bridging_form, rate_walk
 from virest.diagnosis.field.sudden import best_instant
 from virest.diagnosis.field.words import finding_of
@@ -195,6 +195,22 @@ def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:
     assert np.corrcoef(found.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
 
 
+@pytest.mark.parametrize(("seed", "sway_m"), [(101, 0.1), (102, 0.25)], ids=["shaken", "at_4_g"])
+def test_a_wrong_focal_length_beside_it_keeps_its_name(seed: int, sway_m: float) -> None:
+    """A focal drift compensated for both before the field; forces beyond 2 g were taken for 2 g."""
+    wall = replace(HAND, seed=seed, sway_m=sway_m, plane_per_m=(0.05, -0.1, 0.35), accel_bias_m_s2=(0.0, 0.0, 0.0))
+    phone = StrangePhone(wall, Strange(gyro=lambda t, reading, force: reading + force @ (0.6 * PER_FORCE).T))
+    lens = phone.profile.intrinsics
+    assert lens is not None
+    shorter = replace(lens, fx_px=lens.fx_px / 1.04, fy_px=lens.fy_px / 1.04)
+    verdict, fields = judged(phone, replace(phone.profile, depth_m=None, intrinsics=shorter), rungs=1)
+    assert [entry.name for entry in verdict.accepted] == ["focal_length"]
+    assert verdict.model.profile.intrinsics is not None
+    assert verdict.model.profile.intrinsics.fx_px == pytest.approx(lens.fx_px, rel=1e-3)
+    assert [field.covariates for field in fields] == [("acceleration",)]
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+
+
 def test_a_filled_gap_is_bridged_from_the_points() -> None:
     """A straight line in the log is seen in the log, confirmed by the points, and replaced by what they tell."""
     phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=filled(1.0, 1.15)))
@@ -362,6 +378,12 @@ def test_nothing_hidden_has_no_field_and_no_stretch(seed: int) -> None:
     assert not fields
     assert not verdict.model.profile.fields
     assert not doubtful_stretches(phone.imu)
+
+
+@pytest.mark.parametrize(("size", "left_px", "stated"), [(0.55, 1.2, False), (0.55, 0.25, True), (0.05, 1.2, True)])
+def test_a_field_that_no_phone_has_must_explain_the_points(size: float, left_px: float, stated: bool) -> None:
+    """A zoom by half explains them; where 1.2 px are left of 0.24 px of noise, the model does not follow the frames."""
+    assert is_believable("scale", [np.array([[0.0], [size]])], left_px, 0.24) is stated
 
 
 def test_named_causes_alone_are_no_field() -> None:

@@ -285,6 +285,22 @@ def test_the_scene_begins_with_gravity_down() -> None:
     np.testing.assert_allclose(scene.plane_per_m, sight, atol=1e-4)
 
 
+def test_a_swaying_camera_is_found_from_rest() -> None:
+    """Accelerations of 10 m/s², integrated twice from rest, leave the room; fits stayed there, 10 σ from the points."""
+    recording = recorded(
+        Setup(seed=59, sway_m=0.4, velocity_m_s=(-0.4, 0.3, -0.6), plane_per_m=(0.0, -0.1, 0.4), rate_rad_s=1.2,
+              frames=70, points=15, gyro_noise_rad_s=0.001)
+    )  # fmt: skip
+    table = recording.table()
+    known = integrate_motion(recording.imu, recording.profile, translation=True)
+    fitted = fit_tracks(recording.imu, table, recording.profile, (), start_scene(recording.imu, known, table, 0.5))
+    truth = recording.scene(table)
+    assert isinstance(fitted.scene, InertialMotion)
+    assert fitted.scale == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(fitted.scene.velocity_m_s, truth.velocity_m_s, atol=0.05)
+    np.testing.assert_allclose(fitted.scene.plane_per_m, truth.plane_per_m, atol=0.03)
+
+
 def test_what_cancels_in_a_combination_is_not_doubted() -> None:
     """Two values whose errors cancel in their sum; a correction of one alone must not come back in it."""
     together = np.array([[1.0, -1.0], [-1.0, 1.0]])

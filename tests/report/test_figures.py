@@ -2,8 +2,9 @@
 
 import cv2
 import numpy as np
+import pytest
 
-from virest.report.figures import comparison_figure, ladder_figure, residual_figure
+from virest.report.figures import _draw_rung, canvas, comparison_figure, ladder_figure, residual_figure
 
 
 def decoded(data):
@@ -47,6 +48,14 @@ def test_few_residuals_and_no_rung_make_a_figure_too():
     assert decoded(residual_figure(one, {})).size
     assert decoded(residual_figure({}, {})).size
     assert decoded(ladder_figure([])).size
+
+
+@pytest.mark.parametrize(("tried", "mark"), [({"flicker": 0.01}, ", held-out frames"), ({}, "")])
+def test_an_axis_says_what_was_held_out(tried, mark):
+    """Causes of brightness are judged on held-out frames as all others; without a candidate there is only the fit."""
+    axes = canvas(4.0, 3.0).subplots()
+    _draw_rung(axes, ("photometric_rms", 0.02, tried, None), 1, "")
+    assert axes.get_xlabel().replace("\\_", "_") == f"photometric_rms{mark}"
 
 
 def test_what_entered_stands_out_on_its_rung():

@@ -40,6 +40,14 @@ KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
 UNITS = {"row": "1", "radius": "px", "x": "px", "y": "px", "time": "s", "focus": "1/m", "focal": "1"}
 """Units of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout; ``radius``:
 from the principal point; ``focal``: logged focal length over its median."""
+UNIT_SCALES = {
+    "delay": (1e3, "ms"),
+    "displacement": (1.0, "px"),
+    "scale": (100.0, "%"),
+    "blur": (1.0, "px"),
+    "rate": (1.0, "rad/s"),
+}
+"""Factor and unit in which people read the values of each kind."""
 TIMED_BY_IMU = ("scale", "rate")
 """Kinds whose times are on the IMU clock; those of the others are on the camera clock."""
 _FIXED_POINT_STEPS = 5

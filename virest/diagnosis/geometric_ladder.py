@@ -108,6 +108,18 @@ def climb(
     return verdict
 
 
+def climb_on(
+    evidence: Evidence, nominal: CameraProfile, model: Model, accepted: tuple[Accepted, ...]
+) -> tuple[Model, tuple[Accepted, ...]]:
+    """One more rung, of single causes, from a model that holds fields: (model, causes), the same where none enters."""
+    context = SearchContext(evidence, nominal, (), FarStart(), one_by_one, in_pairs=False)
+    step, _, rung = _rung(context, model, list(accepted))
+    if step is None:
+        return model, accepted
+    path = _Path(model, accepted, ()).further(context, step, rung)
+    return path.model, path.accepted
+
+
 def _left_open(context: SearchContext, verdict: GeometricVerdict) -> dict[str, Array]:
     """Variance that further causes would add to the accepted values; empty unless residuals exceed the noise."""
     effects = [entry.effect for entry in verdict.accepted if entry.effect is not None and entry.effect.term is not None]
@@ -229,6 +241,8 @@ class SearchContext:
     """Names of the causes that may enter; None: all."""
     bridged: Callable[[Model], Model] | None = None
     """Estimates the rates in doubtful intervals of the log beside a model's causes; None: there are none."""
+    in_pairs: bool = True
+    """Whether pairs of causes are tried where single ones gain little."""
 
     def with_bridges(self, model: Model) -> Model:
         """The model with rates in the doubtful intervals of the log; its scene is refitted to the ladder's pairs."""
@@ -298,7 +312,7 @@ def _rung(context: SearchContext, model: Model, accepted: list[Accepted]) -> tup
     rung = Rung(None, {j.candidate.name: j.rms * typical for j in trial.judged}, trial.before.rms * typical, GEOMETRY)
     step, rival = _best_single(model, trial)
     small = step is None or step.part < SMALL_GAIN
-    if small and better and min(entry.scale for entry in (base, *better)) > EXCESS_SCALE:
+    if context.in_pairs and small and better and min(entry.scale for entry in (base, *better)) > EXCESS_SCALE:
         pair, other = _best_pair(context, model, tried, base, better)
         if pair is not None:
             step, rival = pair, other

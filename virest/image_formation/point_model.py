@@ -310,6 +310,11 @@ class Paths:
         moved = self.path + velocity * self.since_s[:, None] + 0.5 * scene.gravity_m_s2 * self.since_s[:, None] ** 2
         return moved - self.per_bias @ scene.accel_bias_m_s2 + self.per_delay * scene.accel_delay_s
 
+    def shared_slopes(self) -> Array:
+        """Change (n, 3, 7) of the centre per gravity, accelerometer bias and delay."""
+        fallen = np.eye(3) * (0.5 * self.since_s**2)[:, None, None]
+        return np.concatenate([fallen, -self.per_bias, self.per_delay[..., None]], axis=-1)
+
 
 @dataclass(frozen=True, slots=True)
 class Moved:
@@ -362,7 +367,7 @@ def _moved_inertially(
     per_plane = world / clearance[:, None] + (inverse_depth / clearance)[:, None] * centre_1
     if scene.plane_axes is not None:
         per_plane = np.einsum("ni,nij->nj", per_plane, scene.plane_axes[window])
-    first, second = (_shared_slopes(each, path.since_s, path.per_bias, path.per_delay) for path in paths)
+    first, second = (path.shared_slopes() for path in paths)
     shared = (first - second) * inverse_depth[:, None, None]
     shared = shared + step[:, :, None] * np.einsum("ni,nik->nk", nearer, first)[:, None, :]
     own = np.zeros((len(world), 3, scene.windows, 6))
@@ -372,11 +377,6 @@ def _moved_inertially(
     own[rows, :, window, 3:] = step[:, :, None] * per_plane[:, None, :]
     per_entry = np.concatenate([shared, own.reshape(len(world), 3, -1)], axis=-1)
     return Moved(step, paths, inverse_depth, per_entry)
-
-
-def _shared_slopes(each: Array, since: Array, bias: Array, delay: Array) -> Array:
-    """Change (n, 3, 7) of the camera's centre per gravity, accelerometer bias and delay."""
-    return np.concatenate([each * (0.5 * since**2)[:, None, None], -bias, delay[..., None]], axis=-1)
 
 
 def centre(

@@ -20,7 +20,7 @@ from virest.errors import ImuError
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, with_profile
 from virest.inference.clustered import CovarianceModel, Index, adjusted_sums, scatter
 from virest.inference.coded_motion import DEVIATION, USUAL, drawn_px, step_slopes
-from virest.inference.descent import MAX_ITERATIONS, descend, slices
+from virest.inference.descent import MAX_ITERATIONS, Slopes, descend, slices
 from virest.inference.profile_curvature import at_profile_minimum
 from virest.inference.robust import CAUCHY
 from virest.inference.term import Term
@@ -33,6 +33,7 @@ from virest.inference.track_evidence import (
     TrackSystem,
     lengths_and_ways,
 )
+from virest.inference.travel_start import linear_start
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 Array = NDArray[np.float64]
@@ -190,6 +191,8 @@ def fit_tracks(
     state = State(known, scene, np.zeros(sum(map(len, terms))), ANY_DEPTH if directed else 0.0)
     evidence = TrackEvidence(imu, table, terms, scene)
     look: Linearisation | None = None
+    if isinstance(scene, InertialMotion) and max_iterations and not scene.velocity_m_s.any():
+        state, look = _started(evidence, state, scene)
     for _ in range(SPREAD_PASSES if inertial else 1):
         system = descend(evidence, state, max_iterations, look, covariances)
         spread, look = evidence.depth_spread(system), system.look
@@ -208,6 +211,16 @@ def fit_tracks(
         coded = drawn_px(slopes, table.noise_px[table.pair], table.bits_per_px)
     moved = [_moved_by(evidence, system, inverse, errors) for errors in (coded, errors_px)]
     return _conclude(table, terms, system, inverse, bend, spread, blocks, (moved[0], np.linalg.norm(moved[1], axis=-1)))
+
+
+def _started(evidence: TrackEvidence, rest: State, scene: InertialMotion) -> tuple[State, Linearisation]:
+    """The linear start of a scene at rest, or rest where that fits better; and its linearisation."""
+    look = evidence.look(rest, None, Slopes.HERE)
+    moving = replace(rest, scene=linear_start(rest.known, evidence.table, look.prediction, scene))
+    ahead = evidence.look(moving, look, Slopes.HERE)
+    at_rest, travelling = evidence.weighed(rest, look), evidence.weighed(moving, ahead)
+    better = travelling.cost(at_rest.scale) < at_rest.cost(at_rest.scale)
+    return (moving, ahead) if better else (rest, look)
 
 
 def _conclude(

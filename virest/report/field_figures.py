@@ -10,19 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from virest.camera.field import UNITS, Field
+from virest.camera.field import UNIT_SCALES, UNITS, Field
 from virest.diagnosis.findings import FieldFinding
 from virest.report.figures import COVARIATES, as_file, canvas, equal_bins, literal
 
 SAMPLES, CELLS, ARROWS = 200, 60, 13
 """Points of a drawn curve, cells of a map and arrows along one side: fine enough at the printed size."""
-UNIT_SCALES = {
-    "delay": (1e3, "ms"),
-    "displacement": (1.0, "px"),
-    "scale": (100.0, "%"),
-    "rate": (1.0, "rad/s"),
-    "blur": (1.0, "px"),
-}
 NAMES = {
     "row": "fraction of the readout",
     "time": "time",

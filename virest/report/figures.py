@@ -11,7 +11,6 @@ import numpy as np
 from virest.arrays import Array, Index, Mask, Picture
 from virest.calibration.response_curve import CurveFit
 from virest.capture.pixels import BT601_LUMA
-from virest.effects.records import PHOTOMETRY
 from virest.errors import printable
 
 FORMATS = ("png", "svg", "pdf")
@@ -209,7 +208,7 @@ def ladder_figure(rungs: Sequence[RungBars], title: str = "", image_format: str 
 def _draw_rung(axes: Any, rung: RungBars, most: int, name: str) -> None:
     """Bars of one rung, as thick as if there were ``most`` of them; the error before stands above its line.
 
-    Brightness is mostly judged by the fit itself, everything else on held-out frames.
+    Causes are judged on held-out frames; a rung without any has only the error of its fit.
     """
     quantity, before, tried, entered = rung
     known = sorted((after, name) for name, after in tried.items() if np.isfinite(after))
@@ -223,7 +222,7 @@ def _draw_rung(axes: Any, rung: RungBars, most: int, name: str) -> None:
         side = "right" if before > 0.5 * axes.get_xlim()[1] else "left"
         axes.annotate(f"before: {before:.3g}", (before, 1), xycoords=("data", "axes fraction"), xytext=(0, 3),
                       textcoords="offset points", ha=side, color="crimson", fontsize=8)  # fmt: skip
-    held_out = "" if quantity == PHOTOMETRY else ", held-out frames"
+    held_out = ", held-out frames" if known else ""
     axes.set_xlabel(literal(quantity) + held_out)
     if name:
         axes.set_title(literal(name), fontsize=10, pad=18)

@@ -21,8 +21,8 @@ SENSORS = {**dict.fromkeys(RATES, "rate"), **dict.fromkeys(FORCES, "acceleration
 """Common name of the axes of a sensor."""
 STEP_EDGE_S = 1e-3
 """Width of a sudden change."""
-FORCE_REACH_M_S2 = 20.0
-"""About 2 g: a hand-held phone stays below this."""
+FORCE_REACH_M_S2 = 80.0
+"""8 g, the range of phones' accelerometers: beyond its knots a field is constant, and a shaken phone feels 3 g."""
 STD = {"delay": 0.01, "displacement": 30.0, "scale": 0.2, "rate": 1.0}
 """Prior σ of a free number, 10 times the usual size in phones: it only regularises undetermined numbers."""
 QUOTIENT = {"delay": 1e-4, "displacement": 0.1, "scale": 1e-4, "rate": 2e-3}

@@ -7,7 +7,7 @@ stays if it improves held-out time blocks.  Causes that it makes redundant are t
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -17,17 +17,19 @@ from numpy.typing import NDArray
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals, point_residuals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
-from virest.diagnosis.field.forms import OVER, FieldForm
+from virest.diagnosis.field.forms import OVER, STD, FieldForm
 from virest.diagnosis.field.records import FittedField
 from virest.diagnosis.field.screening import MIN_LOCAL_T, MIN_T, RIVAL_T, Design, Scored, Selection, score_forms, select
 from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
+    EXCESS_SCALE,
     FINAL_POINTS,
     LARGE_GAIN,
     MIN_GAIN,
     Accepted,
     GeometricVerdict,
+    climb_on,
     p_of,
 )
 from virest.inference.chance import beyond_noise, t_ratio
@@ -84,15 +86,21 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         if (step := next((step for step in steps if step is not None), None)) is None:
             break
         chosen, entered, after = step
-        before = entered.before
-        if len(after.accepted) < len(state.accepted):
-            before = _held_out(evidence, _without_form(after.model, after.forms[-1]), fitted)
+        before, last = entered.before, entered.after
+        after = _with_other_causes(evidence, found, after)
+        if after.accepted != state.accepted:
+            less = _without_form(after.model, after.forms[-1])
+            before, last = (_held_out(evidence, m, fitted, entered.form.local) for m in (less, after.model))
         model = after.model
         fitted = evidence.fit(model, model.terms, evidence.table(model, FINAL_POINTS))
         state = replace(after, model=replace(model, profile=fitted.profile, scene=fitted.scene))
-        typical = evidence.typical_px
+        typical, form = evidence.typical_px, after.forms[-1]
+        left_px, noise_px = capped_rms(fitted.distance) * typical, evidence.noise_px(fitted)
+        if not is_believable(form.kind, form.values(fitted.value(form.name)), left_px, noise_px):
+            log.debug("no phone has it, and it leaves %.3g px: %s", left_px, form.name)
+            break
         stability = chosen.selection.stability if chosen.selection else None
-        before_px, after_px = before.rms * typical, entered.after.rms * typical
+        before_px, after_px = before.rms * typical, last.rms * typical
         fields = [entry for entry in fields if entry.form.name in {form.name for form in after.forms}]
         fields.append(FittedField(entered.form, chosen.rivals, chosen.p_value, stability, before_px, after_px, fitted))
         log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
@@ -110,6 +118,15 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         noise_px=evidence.noise_px(fitted),
         fields=[*found.fields, *fields],
     )
+
+
+def is_believable(kind: str, values: Iterable[Array], left_px: float, noise_px: float) -> bool:
+    """Whether a field's values are below 10 times the usual in phones, or leave the points nothing but their noise.
+
+    A model that does not follow the points at all is best improved by a field that no phone has.
+    """
+    usual = max(float(np.abs(part).max(initial=0.0)) for part in values) < STD[kind]
+    return usual or left_px < EXCESS_SCALE * noise_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -428,6 +445,21 @@ def _without_redundant_causes(evidence: Evidence, found: GeometricVerdict, state
             return state
         log.debug("stood in for a field: %s", [entry.name for entry in leaving])
         state = state.without(found, leaving)
+
+
+def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _SearchState) -> _SearchState:
+    """Add the cause that the points need beside a new field, and remove what it makes redundant.
+
+    Before the field, another cause may have compensated for both: a focal drift for a wrong focal length beside a
+    gyroscope that feels gravity.  Nothing is sought where the residuals are noise.
+    """
+    fitted = evidence.fit(state.model, state.model.terms, evidence.table(state.model, JUDGE_POINTS))
+    if fitted.scale < EXCESS_SCALE:
+        return state
+    model, accepted = climb_on(evidence, found.nominal.profile, state.model, state.accepted)
+    if len(accepted) == len(state.accepted):
+        return state
+    return _without_redundant_causes(evidence, found, replace(state, model=model, accepted=accepted))
 
 
 def _loses_without(judged: _Judged, by_point: bool, less: Model) -> bool:

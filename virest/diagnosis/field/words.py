@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.field import FORCES, RATES, Field
+from virest.camera.field import FORCES, KINDS, RATES, UNIT_SCALES, Field
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
 from virest.diagnosis.field.stretches import axis_names
@@ -110,7 +110,6 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "log the phone at rest for ten minutes from a cold start",
     ),
 }
-UNIT_SCALES = {"delay": (1e3, "ms"), "displacement": (1.0, "px"), "scale": (100.0, "%"), "rate": (1.0, "rad/s")}
 
 
 def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding:
@@ -342,7 +341,7 @@ def _size(fields: tuple[Field, ...]) -> tuple[float, float | None]:
 def _unit(kind: str, covariates: tuple[str, ...]) -> str:
     if covariates == ("acceleration",):
         return "rad/s per m/s²"
-    return {"delay": "s", "displacement": "px", "scale": "1", "rate": "rad/s"}[kind]
+    return KINDS[kind][0]
 
 
 def _where(field: Field) -> str:
