@@ -19,7 +19,7 @@ def test_a_sine_under_unequal_weights_is_found_with_its_phase(rng: np.random.Gen
     frequency = np.arange(90.0, 110.0, 2.0)
     angle = 2 * np.pi * 100.0 * time_s
     values = level + 0.2 * np.sin(angle) - 0.1 * np.cos(angle)
-    fit, power = _sines(patch, values, stiffness, time_s, frequency)
+    fit, power = _sines(patch, values, stiffness, time_s, np.zeros(patch.size), frequency)
     assert frequency[np.argmax(power)] == 100.0
     np.testing.assert_allclose(fit[5], (0.2, -0.1), atol=1e-6)
 
