@@ -520,6 +520,12 @@ def test_a_focus_that_hunts_is_a_scale_over_a_few_frames() -> None:
     assert gained(field) > 0.8
 
 
+def test_what_points_of_one_frame_share_below_their_noise_is_no_field() -> None:
+    """Trackers err alike over a blurred frame: a scale of single frames that gains 0.3 of the noise may be theirs."""
+    phone = StrangePhone(replace(HAND, seed=91), Strange(longer=lambda t: 0.001 * np.sin(2 * np.pi * 1.4 * t)))
+    assert not judged(phone, phone.profile)[1]
+
+
 def test_a_focal_length_that_comes_back_at_once_is_no_step() -> None:
     """A pulse of a fifth of a second lies in too few frames for a test by signs, and is found by their size."""
     phone = StrangePhone(

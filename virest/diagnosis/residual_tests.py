@@ -10,7 +10,7 @@ from virest.arrays import Array, Index
 from virest.diagnosis import photometry, picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_verdict import GeometricVerdict
-from virest.diagnosis.structure import Structure, structures
+from virest.diagnosis.structure import STRUCTURE_NOISES, Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
 from virest.image_formation.point_model import TrackTable, seen_s
 from virest.inference.chance import chance_of, chi2_tail
@@ -19,8 +19,8 @@ from virest.inference.track_fit import TrackFit
 
 log = logging.getLogger(__name__)
 
-STRUCTURE_PX, STRUCTURE_NOISES = 0.05, 0.4
-"""Structure above this size, and above this fraction of the noise, has a cause."""
+STRUCTURE_PX = 0.05
+"""Structure above this size, and above STRUCTURE_NOISES of the noise, has a cause."""
 STRUCTURE_P = 1e-4
 """p value of a structure, and of excess noise: the eight tests of points together stay below FALSE_ALARM."""
 TRACKING_BIAS_PX = 0.02

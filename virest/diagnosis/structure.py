@@ -13,6 +13,9 @@ import numpy as np
 from virest.arrays import Array, Index
 from virest.inference.chance import chi2_tail, normal_deviate, student_tail
 
+STRUCTURE_NOISES = 0.4
+"""Points of one frame share errors of tracking, which grow with the blur: up to a third of the noise, rms, in captures
+of 20 ms exposures without any effect.  Structure in single frames must exceed this fraction of the noise."""
 BINS = 10
 """Bins of a covariate, with equally many residuals."""
 LEAST_IN_CELL = 4

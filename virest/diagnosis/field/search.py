@@ -32,6 +32,7 @@ from virest.diagnosis.geometric_ladder import (
     climb_on,
     p_of,
 )
+from virest.diagnosis.structure import STRUCTURE_NOISES
 from virest.inference.chance import beyond_noise, t_ratio
 from virest.inference.track_fit import Term, TrackFit
 
@@ -202,8 +203,10 @@ def _step(
         return None
     more = _SearchState(entered.model, state.accepted, (*state.forms, entered.form))
     after = _without_redundant_causes(evidence, found, more)
-    gained_px = np.sqrt(max(entered.before.rms**2 - entered.after.rms**2, 0.0)) * evidence.typical_px
-    small = proposal.selection is not None and gained_px < MIN_SIZE_PX
+    typical, left = evidence.typical_px, entered.after.rms
+    gained_px = np.sqrt(max(entered.before.rms**2 - left**2, 0.0)) * typical
+    shared_px = STRUCTURE_NOISES * left * typical if entered.form.local else 0.0
+    small = gained_px < max(MIN_SIZE_PX if proposal.selection else 0.0, shared_px)
     return (
         None
         if (small or proposal.instead) and len(after.accepted) == len(state.accepted)
