@@ -24,7 +24,7 @@ from virest.restoration.frame import (
     restore_frame,
 )
 from virest.restoration.parameters import degradation_parameters, unknown_parameters
-from virest.restoration.positive_light import consistent_light, without_negative_light
+from virest.restoration.positive_light import blur_along_paths, consistent_light, without_negative_light
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
 from virest.restoration.statistics.of_picture import most_blurred
 from virest.simulation.phone_pictures import sharpen
@@ -370,7 +370,7 @@ def test_travel_over_depth_is_undone_and_called_no_metres() -> None:
     turning = camera((0.0, -2.0, 0.0), 0.02)
     travel = FrameTranslation(np.array([0.4, 0.1, 0.2]), np.zeros(3), np.array([0.05, 0.0, 0.6]), 1.6, "triangulated")
     logs = []
-    for known in (travel, replace(travel, depth_m=None, in_metres=False)):
+    for known in (travel, replace(travel, depth_m=None, unit=1)):
         motion = row_motion(turning.trajectory, turning.profile, FRAME.time_s, FRAME.exposure_s, translation=known)
         logs.append(degradation_parameters(motion, turning.trajectory))
     metres, over_depth = logs
@@ -523,10 +523,11 @@ def test_light_that_agrees_is_left_alone_below_nothing_too() -> None:
     assert curve.light_range[0] < -0.05
     channels = [np.full((40, 60), light, np.float32) for light in (-0.05, 0.1, 0.3)]
     blurred = _seen_along(np.linspace(-6, 6, 16)[:, None] * (1.0, 0.3), curve)
-    found = consistent_light(blurred, luma_of(channels), channels, channels, 2, 2)
+    along = blur_along_paths(blurred, 2)
+    found = consistent_light(blurred, luma_of(channels), channels, channels, along, 2, 2)
     np.testing.assert_allclose(found, channels, atol=1e-4)
     luma = np.full((80, 120), -0.05, np.float32)
-    np.testing.assert_allclose(without_negative_light(blurred, luma, 2, 2), luma, atol=1e-4)
+    np.testing.assert_allclose(without_negative_light(blurred, luma, along, 2, 2), luma, atol=1e-4)
 
 
 def test_waves_on_dark_ground_shrink_to_the_grounds_own_light() -> None:
@@ -535,7 +536,7 @@ def test_waves_on_dark_ground_shrink_to_the_grounds_own_light() -> None:
     light = np.full((80, 120), 0.02, np.float32)
     light[:, 60:] = 0.4 + 0.1 * np.sin(np.arange(60) * 2 * np.pi / 12)
     light[:, :48] += 0.2 * np.sin(np.arange(48) * 2 * np.pi / 12)
-    found = without_negative_light(blurred, light, 2, 2)
+    found = without_negative_light(blurred, light, blur_along_paths(blurred, 2), 2, 2)
     assert found.min() >= 0
     waves = found[:, 12:36]
     assert abs(waves.mean() - 0.02) < 0.005, "0.07 where the negative light is only cut off"

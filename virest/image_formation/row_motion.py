@@ -45,12 +45,18 @@ class FrameTranslation:
     """Source of the depth: ``triangulated``, ``profile`` or ``none``."""
     relief: Relief | None = None
     """Relief on the plane, at the reference time; None: unknown or none."""
-    in_metres: bool = True
-    """False: only velocity over depth is known; lengths have a common unknown unit and must not be logged as metres."""
+    unit: int = 0
+    """0: metres.  Otherwise only velocity over depth is known, and lengths must not be logged: frames with the same
+    number share an unknown unit of length."""
     jerk_m_s3: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) j, at the reference time."""
     snap_m_s4: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) k: constant, and 0 for the motion over a single frame."""
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether lengths are in metres."""
+        return self.unit == 0
 
     def position_m(self, since_reference_s: Array) -> Array:
         """Centre (..., 3) at times (...) from the reference."""
@@ -238,7 +244,7 @@ def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, l
     """The motion of one frame, tabulated over the rows of another frame too; its row clock and reference are kept.
 
     lens: for the whole trajectory.  The translation leads from the frame's to the other frame's; where that is unknown,
-    it is extrapolated with the frame's own acceleration.
+    or in another unit, it is extrapolated.
     """
     span_s = min(motion.start_s, other.start_s), max(motion.end_s, other.end_s)
     return _tabulated(
@@ -248,9 +254,9 @@ def covering_both(motion: RowMotion, other: RowMotion, trajectory: Trajectory, l
 
 
 def _leading_to(motion: RowMotion, other: RowMotion, trajectory: Trajectory) -> FrameTranslation | None:
-    """A frame's translation, continued to that of another frame where both are known in metres."""
+    """A frame's translation, continued to that of another frame where both are known in the same unit."""
     here, there, after_s = motion.translation, other.translation, other.reference_s - motion.reference_s
-    if here is None or there is None or not (here.in_metres and there.in_metres) or not after_s:
+    if here is None or there is None or here.unit != there.unit or not after_s:
         return here
     turn = trajectory.orientation(motion.reference_s).T @ trajectory.orientation(other.reference_s)
     return here.meeting(turn @ there.velocity_m_s, turn @ there.acceleration_m_s2, after_s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import takewhile
 
 import numpy as np
 
@@ -219,6 +220,8 @@ class FrameMotion:
     jerk_m_s3: Array
     """(3,) constant over the frame."""
     depth: FrameDepth
+    window: int
+    """Number of the window, counted from 1 over all stretches: its lengths share one unit, known or not."""
     unscaled: str = ""
     """Why velocity is known only over depth, not in metres; empty if it is known in metres."""
 
@@ -278,7 +281,9 @@ class VisualInertialAlignment:
         velocity = stretch.velocity(window, time_s) @ known.trajectory.orientation(time_s[0])
         half_jerk, acceleration, _ = np.polyfit(time_s[1:] - time_s[0], velocity[1:], 2)
         depth = stretch.depth(window, float(time_s[0]))
-        return FrameMotion(velocity[0], reference_s, acceleration, 2 * half_jerk, depth, unscaled)
+        before = takewhile(lambda other: other is not stretch, self.stretches)
+        number = 1 + window + sum(len(other.windows) for other in before)
+        return FrameMotion(velocity[0], reference_s, acceleration, 2 * half_jerk, depth, number, unscaled)
 
     def velocity_std_m_s(self, camera_time_s: Array) -> Array:
         """Standard deviations (n, 3) of the velocity in camera axes at times (n,); NaN where not known in metres.

@@ -251,10 +251,11 @@ def check_agreement(
         better = _clearly_better(coarse.offset_s, coarse.explained_at, offset_s, 3 * len(observed.pairs))
         return Agreement(True, explained=explained, best_offset_s=better)
     elsewhere = None if coarse.doubt(len(observed.pairs), focal_px) else coarse.time_offset_s
-    hint = _with_other_axes(observed, imu, profile, search_s)
-    hint = hint or "was the movie stabilised in the camera, or is it from another recording?"
     if elsewhere is not None:
         hint = f"at an offset of {elsewhere:+.3f} s it would explain {coarse.explained:.0%}"
+    else:
+        hint = _with_other_axes(observed, imu, profile, search_s)
+        hint = hint or "was the movie stabilised in the camera, or is it from another recording?"
     reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the frames' rotation: {hint}"
     return Agreement(False, reason, explained=explained, best_offset_s=elsewhere)
 

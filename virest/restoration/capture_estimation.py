@@ -319,7 +319,7 @@ def _translation(motion: FrameMotion, stated_depth_m: float | None) -> FrameTran
         found_m if stated_depth_m is None else stated_depth_m,
         "triangulated" if stated_depth_m is None else "profile",
         depth.relief,
-        not motion.unscaled,
+        motion.window if motion.unscaled else 0,
         motion.jerk_m_s3,
     )
 

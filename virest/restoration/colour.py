@@ -12,7 +12,13 @@ from virest.image_formation.blur import Image, TileGrid
 from virest.restoration.blurred import BlurredPicture, block_means, luma_of, with_vignetting
 from virest.restoration.encoding import grey_levels
 from virest.restoration.neighbours.joint import HALF, NeighbourPicture
-from virest.restoration.positive_light import LIGHT_STEPS, consistent_light, without_negative_light
+from virest.restoration.positive_light import (
+    LIGHT_STEPS,
+    blur_along_paths,
+    consistent_light,
+    shrunk,
+    without_negative_light,
+)
 from virest.restoration.row_chunks import RowRenderer
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.statistics.measure import STORED_COLOUR_PX
@@ -55,15 +61,18 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
     few = settings.iterations <= FEW_ITERATIONS
     scale = COARSE_COLOUR_SCALE if few and blurred.longest_px > COARSE_COLOUR_BLUR_PX else COLOUR_SCALE
     steps = 1 if few else LIGHT_STEPS
-    sharp = without_negative_light(blurred, sharp, scale, steps)
-    small, recorded = _shrunk(sharp, blurred, scale), _small_differences(blurred, scale)
+    along = blur_along_paths(blurred, scale) if blurred.longest_px >= scale else None
+    if along is not None:
+        sharp = without_negative_light(blurred, sharp, along, scale, steps)
+    small, recorded = shrunk(sharp, blurred, scale), _small_differences(blurred, scale)
     red_blue = _sharp_differences(blurred, recorded, small, settings, scale)
     seen, light = (
         [cv2.add(luma, difference) for difference in _three_differences(*differences)]
         for luma, differences in (recorded, (small, red_blue))
     )
-    channels = consistent_light(blurred, small, seen, light, scale, steps)
-    small_grey, *differences = _grey_differences(blurred, small, channels)
+    if along is not None:
+        light = consistent_light(blurred, small, seen, light, along, scale, steps)
+    small_grey, *differences = _grey_differences(blurred, small, light)
     slopes = _regression_slopes(small_grey, differences, blurred.statistics.noise_levels**2, FINE_SIDE)
     rests = [cv2.subtract(d, cv2.multiply(s, small_grey)) for d, s in zip(differences, slopes, strict=True)]
 
@@ -179,14 +188,6 @@ def _regression_slopes(luma: Image, differences: list[Image], noise_power: Any, 
     divisor = cv2.add(power, noise_power)
     together = (cv2.subtract(around(cv2.multiply(luma, d)), cv2.multiply(mean, around(d))) for d in differences)
     return [cv2.divide(product, divisor) for product in together]
-
-
-def _shrunk(sharp: Image, blurred: BlurredPicture, scale: int) -> Image:
-    """The luma at the size of the colour differences."""
-    height, width = blurred.light[0].shape
-    if sharp.shape == (height, width):
-        return block_means(sharp, scale)
-    return cv2.resize(sharp, (-(-width // scale), -(-height // scale)), interpolation=cv2.INTER_LINEAR)
 
 
 def _three_differences(red: Image, blue: Image) -> list[Image]:

@@ -9,7 +9,7 @@ leaves alone what agrees.  Light is counted from the curve's darkest, which may 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -18,6 +18,8 @@ from virest.image_formation.blur import Image
 from virest.restoration.blurred import BlurredPicture, block_means, luma_of
 from virest.restoration.tile_layout import sampled_kernels
 
+PathBlur = tuple[Callable[[Image], Image], Callable[[Image], Image]]
+"""A blur and its transpose."""
 LIGHT_STEPS = 2
 """Number of steps.
 
@@ -27,45 +29,44 @@ LEAST_LIGHT = 1e-6
 """Keeps divisors above 0; the darkest grey level is 3e-4."""
 
 
-def without_negative_light(blurred: BlurredPicture, luma: Image, scale: int, steps: int) -> Image:
+def without_negative_light(blurred: BlurredPicture, luma: Image, along: PathBlur, scale: int, steps: int) -> Image:
     """Restored luma, perhaps at reduced size, without negative light, and as bright around it as before.
 
     The luma would still be recorded as with its negative light: where there is none, nothing changes.  Ringing beside a
-    bright thing on dark ground shrinks to the ground's own light.  The steps work at ``scale`` times fewer pixels.
+    bright thing on dark ground shrinks to the ground's own light.  along: of pictures ``scale`` times smaller than the
+    recorded one, at which the steps work.
     """
-    if blurred.longest_px < scale:
-        return luma
-    darkest = _darkest(blurred)
-    light = luma - darkest
+    blur, unblur = along
+    light = luma - _darkest(blurred)
     positive = cv2.max(light, 0.0)
-    small = block_means(positive, scale)
-    reduction = scale * blurred.light[0].shape[0] / luma.shape[0]
-    blur, unblur = _blur_along_paths(blurred, small.shape, reduction)
-    factor, least = np.ones_like(small), _light_of_noise(blurred, blurred.statistics.noise_levels)
-    seen = cv2.max(blur(block_means(light, scale)), 0.0)
+    small, least = shrunk(positive, blurred, scale), _light_of_noise(blurred, blurred.statistics.noise_levels)
+    seen, factor = cv2.max(blur(shrunk(light, blurred, scale)), 0.0), np.ones_like(small)
     for _ in range(steps):
         would = blur(cv2.multiply(small, factor))
         factor = cv2.multiply(factor, unblur(cv2.divide(seen + least, would + least)))
-    size = (scale * small.shape[1], scale * small.shape[0])
-    factor = cv2.resize(factor, size, interpolation=cv2.INTER_LINEAR)[: luma.shape[0], : luma.shape[1]]
-    return cv2.multiply(positive, factor) + darkest
+    factor = cv2.resize(factor, luma.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return cv2.multiply(positive, factor) + _darkest(blurred)
 
 
 def consistent_light(
-    blurred: BlurredPicture, luma: Image, recorded: list[Image], restored: list[Image], scale: int, steps: int
-) -> Sequence[Image]:
+    blurred: BlurredPicture,
+    luma: Image,
+    recorded: list[Image],
+    restored: list[Image],
+    along: PathBlur,
+    scale: int,
+    steps: int,
+) -> list[Image]:
     """Restored light of the channels, (height, width) each, non-negative and consistent with what was recorded.
 
     A channel that is nearly dark, as red is on a green leaf, would be too bright, and striped.  The noise of the
     recorded light is added to both sides of the ratio; light that was not measured corrects nothing.  The luma,
     restored with a better prior, stays as it is.  All are ``scale`` times smaller than the picture.
     """
-    if blurred.longest_px < scale:
-        return restored
+    blur, unblur = along
     darkest = _darkest(blurred)
     seen, light, luma = cv2.merge(recorded) - darkest, cv2.merge(restored) - darkest, luma - darkest
     light = cv2.max(light, 0.0)
-    blur, unblur = _blur_along_paths(blurred, seen.shape[:2], scale)
     noise = float(np.hypot(blurred.statistics.noise_levels, blurred.chroma.colour_noise_levels))
     least, measured = _light_of_noise(blurred, noise), _measured(blurred, scale)
     for _ in range(steps):
@@ -76,6 +77,14 @@ def consistent_light(
     channels = cv2.split(light)
     brighter = cv2.divide(cv2.max(luma, 0.0), cv2.max(luma_of(list(channels)), LEAST_LIGHT))
     return [cv2.multiply(channel, brighter) + darkest for channel in channels]
+
+
+def shrunk(luma: Image, blurred: BlurredPicture, scale: int) -> Image:
+    """A luma of the recorded or of a reduced size at ``scale`` times fewer pixels than the recorded one."""
+    height, width = blurred.light[0].shape
+    if luma.shape == (height, width):
+        return block_means(luma, scale)
+    return cv2.resize(luma, (-(-width // scale), -(-height // scale)), interpolation=cv2.INTER_LINEAR)
 
 
 def _darkest(blurred: BlurredPicture) -> np.float32:
@@ -89,14 +98,12 @@ def _light_of_noise(blurred: BlurredPicture, noise_levels: float) -> float:
     return float(table[int(np.clip(np.rint(noise_levels), 1, 255))] - table[0])
 
 
-def _blur_along_paths(
-    blurred: BlurredPicture, shape: tuple[int, ...], scale: float
-) -> tuple[Callable[[Image], Image], Callable[[Image], Image]]:
-    """The blur of a picture (height, width[, 3]) of this size, ``scale`` times smaller, and the blur's transpose.
+def blur_along_paths(blurred: BlurredPicture, scale: int) -> PathBlur:
+    """The blur of pictures (height, width[, 3]) ``scale`` times smaller than the recorded one, and its transpose.
 
     Instants are a pixel apart along the path; paths vary smoothly over the picture.
     """
-    height, width = shape
+    height, width = (-(-length // scale) for length in blurred.light[0].shape)
     _, _, recorded_px, recorded_sigma_px = sampled_kernels(blurred)
     paths_px, sigma_px = (recorded_px / scale).astype(np.float32), float(recorded_sigma_px.mean()) / scale
     count = int(np.clip(np.ceil(blurred.longest_px / scale), 2, paths_px.shape[2]))

@@ -17,7 +17,6 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import KernelSpread
@@ -359,15 +358,17 @@ def _likeliest_field(off_px: Array, doubt: Array, apart: Array) -> tuple[float, 
     Those with the greatest likelihood of the shifts off_px (n, 2).  doubt: (n,) each tile's noise power over the usual.
     apart: (n, n) distances in tiles' sides.
     """
-    size, best = off_px.size, (np.inf, 0.0, 1.0, 1.0)
+    root, parts = np.sqrt(doubt), np.array(PARTS)[:, None]
+    best = (np.inf, 0.0, 0.0, 1.0)
     for reach in REACHES:
         together = np.exp(-0.5 * (apart / reach) ** 2)
-        for part in PARTS:
-            root = np.linalg.cholesky(part * together + (1 - part) * np.diag(doubt))
-            white = solve_triangular(root, off_px, lower=True)
-            power = max(float((white**2).sum()) / size, 1e-6)
-            unlikely = size * np.log(power) + 4 * float(np.log(np.diag(root)).sum())
-            best = min(best, (unlikely, power, part, reach))
+        values, vectors = np.linalg.eigh(together / np.outer(root, root))
+        spread = parts * np.maximum(values, 0.0) + 1 - parts
+        seen = ((vectors.T @ (off_px / root[:, None])) ** 2).sum(axis=1)
+        power = np.maximum((seen / spread).sum(axis=1) / off_px.size, 1e-6)
+        unlikely = off_px.size * np.log(power) + off_px.shape[1] * np.log(spread).sum(axis=1)
+        likeliest = int(np.argmin(unlikely))
+        best = min(best, (float(unlikely[likeliest]), float(power[likeliest]), PARTS[likeliest], reach))
     _, power, part, reach = best
     return float(np.sqrt(part * power)), float(np.sqrt((1 - part) * power)), reach
 
