@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarStart, candidates_of, worth_beginning
 from virest.diagnosis.cross_validation import (
@@ -45,7 +45,6 @@ __all__ = ["FINAL_POINTS", "MAX_RUNGS", "Accepted", "GeometricVerdict", "Trial",
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 PROMISING = 3
 """Number of causes that each fold may choose from."""
 MIN_GAIN, LARGE_GAIN = POINT_LEVELS.least_gain, POINT_LEVELS.evenness[-1][0]

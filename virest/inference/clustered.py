@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from virest.arrays import Array, Index
+
 RELATIVE_FLOOR = 1e-9
 ABSORBED_FLOOR = 1e-12
 LEAST_LEFT = 0.05

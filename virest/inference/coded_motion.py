@@ -20,13 +20,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict
 from virest.image_formation.row_clock import RowClock
 from virest.motion.scene_motion import Motion
 
-Array = NDArray[np.float64]
 BITS_PER_PX = 0.1
 """Bit rate of the fractions below."""
 MEAN = np.array([0.035, 0.08, 0.04, 0.20, 0.03])
@@ -83,7 +82,7 @@ def step_slopes(known: IntegratedMotion, table: TrackTable, scene: Motion | None
     return StepSlopes(np.array(at_once), np.array(whole) - np.array(at_once), curved_px)
 
 
-def _beyond_affine(points_px: Array, steps_px: Array, pair: NDArray[np.intp]) -> Array:
+def _beyond_affine(points_px: Array, steps_px: Array, pair: Index) -> Array:
     """Steps (n, 2) less the affine flow that fits those of their pair best."""
     basis = np.concatenate([np.ones((len(pair), 1)), points_px - points_px.mean(axis=0)], axis=-1)
     basis /= np.maximum(np.abs(basis).max(axis=0, initial=0.0), 1e-9)

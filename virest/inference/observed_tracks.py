@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import GUESSED_FOCAL
@@ -19,7 +19,6 @@ from virest.inference.frame_rotations import FrameRotations, picture_rotation
 from virest.inference.track_noise import step_noise_px
 from virest.inference.tracking import TrackPair
 
-Array = NDArray[np.float64]
 MIN_TRACKS = 15
 """Fewest points of a usable pair."""
 WINDOW_S = 3.5
@@ -59,7 +58,7 @@ class ObservedTracks:
         vectors = np.array([picture_rotation(self.lens, pair) for pair in self.pairs]).reshape(-1, 3)
         return FrameRotations(middle[first], middle[second], vectors)
 
-    def chosen(self, use: NDArray[np.bool_]) -> ObservedTracks:
+    def chosen(self, use: Mask) -> ObservedTracks:
         """Some of the pairs."""
         kept = tuple(pair for pair, u in zip(self.pairs, use, strict=True) if u)
         return replace(self, pairs=kept, noise_px=self.noise_px[use])
@@ -86,7 +85,7 @@ class ObservedTracks:
             return self, 0.0
         return self.without_cells(astray), float(astray[self.cells(first_px)].mean())
 
-    def astray_cells(self, first_px: Array, distance: Array) -> NDArray[np.bool_]:
+    def astray_cells(self, first_px: Array, distance: Array) -> Mask:
         """Mask (CELLS²,) of cells of the picture that move independently: a dashboard, a passer-by.
 
         first_px (n, 2), distance (n,): points of a fit and their residuals, in standard deviations.  A cell counts if
@@ -101,13 +100,13 @@ class ObservedTracks:
         astray = medians > ASTRAY * (np.median(medians[full]) if len(full) else np.inf)
         return astray & (counts[astray].sum() <= MOST_ASTRAY * counts.sum())
 
-    def without_cells(self, cells: NDArray[np.bool_]) -> ObservedTracks:
+    def without_cells(self, cells: Mask) -> ObservedTracks:
         """Drop the points that start in some cells (CELLS²,) of the picture, and pairs left with too few points."""
         kept = [_selected(pair, ~cells[self.cells(pair.points_first_px)]) for pair in self.pairs]
         use = np.array([len(pair) >= MIN_TRACKS for pair in kept])
         return replace(self, pairs=tuple(kept)).chosen(use)
 
-    def cells(self, points_px: Array) -> NDArray[np.intp]:
+    def cells(self, points_px: Array) -> Index:
         """Number of each point's cell."""
         part = points_px * (CELLS / np.array([self.lens.width, self.lens.height]))
         x, y = np.clip(part.astype(np.intp), 0, CELLS - 1).T
@@ -158,7 +157,7 @@ def guessed_lens(profile: CameraProfile) -> Intrinsics:
     return profile.lens_of(GUESSED_FOCAL * max(profile.width, profile.height))
 
 
-def _selected(pair: TrackPair, rows: NDArray[np.bool_] | slice) -> TrackPair:
+def _selected(pair: TrackPair, rows: Mask | slice) -> TrackPair:
     return replace(pair, points_first_px=pair.points_first_px[rows], points_second_px=pair.points_second_px[rows])
 
 

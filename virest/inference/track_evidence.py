@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict, with_profile
@@ -20,7 +20,6 @@ from virest.inference.term import Term, slopes_of
 from virest.inference.travel_direction import find_directions, without_directions
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
-Array = NDArray[np.float64]
 SMALLEST_SCALE = 0.03
 STALE = {Slopes.ON_THE_WAY: (1.5, 0.5), Slopes.AT_THE_END: (0.1, 0.05), Slopes.HERE: (0.0, 0.0)}
 """Reuse the Jacobian until points move this far (median, px) or the scene changes by this fraction."""

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
@@ -36,7 +36,6 @@ from virest.inference.track_evidence import (
 from virest.inference.travel_start import linear_start
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
-Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.81
 MIN_BLOCKS = 4
 REGIONS = 5

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.tracking import TrackPair
 
-Array = NDArray[np.float64]
 REWEIGHTINGS = 6
 POINTS_PER_TERM = 4
 """Points needed per term of the flow (a cubic has 10 per axis); otherwise a lower order is used."""

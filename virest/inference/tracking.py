@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask, Picture
 from virest.inference.parallel import ParallelMap, one_by_one
 
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 Points = NDArray[np.float32]
 Stream = Iterable[tuple[int, Picture | None]]
 PART_FRAMES = 60
@@ -97,7 +96,7 @@ class TrackPair:
 
 
 def track_pairs(
-    pictures: Iterable[tuple[int, NDArray[np.uint8] | None]],
+    pictures: Iterable[tuple[int, Picture | None]],
     settings: TrackingSettings | None = None,
     progress: Callable[[int], None] | None = None,
     guide: Guide | None = None,
@@ -112,8 +111,8 @@ def track_pairs(
     """
     settings = settings or TrackingSettings()
     pairs: list[TrackPair] = []
-    before: tuple[int, NDArray[np.uint8]] | None = None
-    newest: NDArray[np.uint8] | None = None
+    before: tuple[int, Picture] | None = None
+    newest: Picture | None = None
     for index, picture in pictures:
         repeated = picture is not None and newest is not None and np.array_equal(picture, newest)
         newest = picture
@@ -171,7 +170,7 @@ def _track_part(
     return [pair for pair in track_pairs(gray(frames), guide=guide) if pair.second >= own_from]
 
 
-def find_corners(picture: NDArray[np.uint8], settings: TrackingSettings) -> NDArray[np.float32]:
+def find_corners(picture: Picture, settings: TrackingSettings) -> NDArray[np.float32]:
     """Corners (n, 2) of a grey picture, strongest first, at most ``points_per_cell`` from each cell of the grid.
 
     Strength is the smaller eigenvalue of the structure tensor (Shi & Tomasi 1994).
@@ -193,7 +192,7 @@ def find_corners(picture: NDArray[np.uint8], settings: TrackingSettings) -> NDAr
     return np.stack([x[kept], y[kept]], axis=-1).astype(np.float32)
 
 
-def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
+def _rank_within(group: Index) -> Index:
     """Number of earlier entries with the same group."""
     order = np.argsort(group, kind="stable")
     ordered = group[order]
@@ -211,7 +210,7 @@ def shrink_factor(width: int, height: int, limit_px: int = TrackingSettings().ha
     return factor
 
 
-def _halved(picture: NDArray[np.uint8], limit_px: int) -> tuple[NDArray[np.uint8], int]:
+def _halved(picture: Picture, limit_px: int) -> tuple[Picture, int]:
     """The picture halved until it fits, by means over 2 x 2 pixels, and the factor."""
     factor = shrink_factor(picture.shape[0], picture.shape[1], limit_px)
     for _ in range(factor.bit_length() - 1):
@@ -237,7 +236,7 @@ def _track(
 
 def _guided(
     first: Picture, second: Picture, start: Points, settings: TrackingSettings, between: Between
-) -> tuple[Points, NDArray[np.bool_]]:
+) -> tuple[Points, Mask]:
     """Track points from their predicted positions; points not found there are tracked without the guide.
 
     The first picture is warped into the second, rotation and shear included, before matching.  A point found far from
@@ -259,9 +258,7 @@ def _guided(
     return ahead, good
 
 
-def _repeats(
-    warped: Picture, second: Picture, predicted: Points, ahead: Points, settings: TrackingSettings
-) -> NDArray[np.bool_]:
+def _repeats(warped: Picture, second: Picture, predicted: Points, ahead: Points, settings: TrackingSettings) -> Mask:
     """Mask (n,): the warped picture at the found position matches the second picture about as well as the point itself.
 
     Compares squared differences of patches normalised in mean and contrast; for repetitive texture both are noise.
@@ -287,7 +284,7 @@ def _patches(picture: Picture, points: Points, side: int) -> NDArray[np.float32]
 
 def _there_and_back(
     first: Picture, second: Picture, start: Points, settings: TrackingSettings, levels: int
-) -> tuple[Points, NDArray[np.bool_]]:
+) -> tuple[Points, Mask]:
     """Found positions (n, 2) of points, and the mask (n,) of those that also lead back to their start."""
     ahead, found = _follow(first, second, start, settings, levels)
     back, returned = _follow(second, first, ahead, settings, levels)
@@ -296,7 +293,7 @@ def _there_and_back(
     return ahead, good
 
 
-def _inside(points: Points, picture: Picture, settings: TrackingSettings) -> NDArray[np.bool_]:
+def _inside(points: Points, picture: Picture, settings: TrackingSettings) -> Mask:
     height, width = picture.shape
     edge = settings.border_px
     return (points >= edge).all(axis=-1) & (points[:, 0] < width - edge) & (points[:, 1] < height - edge)
@@ -304,7 +301,7 @@ def _inside(points: Points, picture: Picture, settings: TrackingSettings) -> NDA
 
 def _follow(
     first: Picture, second: Picture, points: Points, settings: TrackingSettings, levels: int
-) -> tuple[Points, NDArray[np.bool_]]:
+) -> tuple[Points, Mask]:
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         first,
         second,

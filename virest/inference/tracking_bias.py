@@ -15,11 +15,10 @@ within 3 s), it is most of the uncertainty.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.inference.track_fit import TrackFit
 
-Array = NDArray[np.float64]
 TYPICAL_NOISE_PX, LEAST_NOISE_PX = 0.15, 0.05
 SHARED = 0.025
 """Fraction of each point's error that is correlated with a value's own pattern.  In 40 captures of known truth, ten

@@ -12,13 +12,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict
 from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.motion.scene_motion import DirectedMotion, InertialMotion
 
-Array = NDArray[np.float64]
 PASSES = 8
 """Of reweighting, and of h at the path found."""
 FARTHEST_PER_M = 0.01

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.camera.response import ResponseCurve
 from virest.image_formation.kernels import blur_chords, smooth_field
 from virest.image_formation.row_motion import RowMotion
@@ -27,8 +28,6 @@ from virest.restoration.statistics.records import ROUNDING_POWER
 from virest.restoration.statistics.ring_fit import RingCells
 from virest.restoration.statistics.rings import RINGS, SIDE
 from virest.restoration.statistics.tile_power import MANY_TILES, cut, light_in_grey_levels, passed_power, windowed_power
-
-Array = NDArray[np.float64]
 
 SCALES = np.geomspace(2**-2, 2**1.5, 15)
 """Path lengths to try, relative to the predicted ones."""
@@ -118,7 +117,7 @@ def path_scale(frames: Iterable[tuple[RowMotion, TilePowers]], bits_per_px: floa
 # ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _least_clipped(luma: NDArray[np.uint8], corners: NDArray[np.intp], curve: ResponseCurve) -> NDArray[np.intp]:
+def _least_clipped(luma: NDArray[np.uint8], corners: Index, curve: ResponseCurve) -> Index:
     """The tiles with little clipped light: the streak of a highlight has a spectrum of its own."""
     clipped = curve.clipped_table(CLIPPED_LEVELS)
     if not clipped[int(luma.max())]:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.response import ResponseCurve
 from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import KernelSpread
@@ -28,7 +29,7 @@ SHRUNK_PARTS, LOOKED_AT = 8, 4
 the rows behind each reduced pixel."""
 SlopeMaker = Callable[[int, int, tuple[int, int]], Image]
 """See :attr:`BlurredPicture.slopes`."""
-FieldMaker = Callable[[NDArray[np.float64]], KernelField]
+FieldMaker = Callable[[Array], KernelField]
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +211,7 @@ def reduced(blurred: BlurredPicture, times: float) -> BlurredPicture:
     def slopes(channel: int, side_px: int, asked: tuple[int, int]) -> Image:
         return blurred.slopes(channel, round(side_px * times), asked)
 
-    def field(centres_px: NDArray[np.float64]) -> KernelField:
+    def field(centres_px: Array) -> KernelField:
         return blurred.field((centres_px + 0.5) * times - 0.5).scaled(1 / times)
 
     luma, holes = cv2.resize(luma_of(blurred.light), size, interpolation=cv2.INTER_LINEAR), blurred.holes

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.folder import GUESSED_FOCAL, Capture, Frame
 from virest.capture.imu import ImuSamples
@@ -103,7 +103,7 @@ def _planned(
     chosen = set(choose_pairs(frames, capture.imu, time_offset_s=profile.time_offset_s or 0.0))
     runs = choose_runs(frames) if _wants_translation(profile, capture) else []
     powers: dict[int, TilePowers] = {}
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     path_px = _rough_paths_px(capture, profile, chosen)
     measured = frames_to_measure(list(path_px), np.array(list(path_px.values()))) if settings.deblur != "none" else ()
     surveyed, lumas = survey_runs(path_px, path_px), dict[int, NDArray[np.uint8]]()
@@ -356,7 +356,7 @@ def _through_resting_lens(pairs: list[TrackPair], capture: Capture, profile: Cam
         return pairs
     lens = moving_lens(integrate_gyro(capture.imu, profile), profile)
 
-    def resting(index: int, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def resting(index: int, points_px: Array) -> Array:
         return resting_points(lens, profile, capture.frames[index], points_px)
 
     return [
@@ -369,9 +369,7 @@ def _through_resting_lens(pairs: list[TrackPair], capture: Capture, profile: Cam
     ]
 
 
-def resting_points(
-    lens: MovingLens, profile: CameraProfile, frame: Frame, points_px: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def resting_points(lens: MovingLens, profile: CameraProfile, frame: Frame, points_px: Array) -> Array:
     """Points (n, 2) of a frame, each at its row's mid-exposure, as the lens at rest would project them."""
     time_s = RowClock(profile).seen_s(points_px, frame.time_s, frame.exposure_s or 0.0)
     return lens.lens.project(lens.rays(points_px, time_s))

@@ -6,15 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.effects.table import GYRO_SCALE_OFF
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import Term
 
-Array = NDArray[np.float64]
 SOURCE = "tracked points against the gyroscope, which contradict the profile's value"
 SKEW_REACH, SKEW_ERROR_S, MOST_SKEWS = 0.015, 0.01, 61
 """Clock skews tried: the range, the largest error in s at the capture's ends of the nearest one, and the largest number

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
@@ -58,9 +59,7 @@ NOTHING_LEFT = "straightening would leave no recorded pixel (check lens, axes an
 MIN_RELIGHT = 0.002
 """Skip illumination corrections below this relative change: they are less than half a grey level everywhere."""
 
-NeighbourFinder = Callable[
-    [PictureStatistics, Callable[[NDArray[np.float64]], KernelField]], tuple[NeighbourPicture, ...]
-]
+NeighbourFinder = Callable[[PictureStatistics, Callable[[Array], KernelField]], tuple[NeighbourPicture, ...]]
 """Select the neighbours to restore a frame with, from the statistics of its luma and its kernels."""
 
 
@@ -120,7 +119,7 @@ def restore_frame(
         if seen is not None and refined.further is not None:
             seen = _with_observed_exposure(motion, seen)
     height, width = picture.shape[:2]
-    curve = motion.profile.response or ResponseCurve("srgb")
+    curve = motion.profile.curve
     found = degradation_parameters(motion, trajectory)
     longest_px = float(equivalent_length_px(found.blur.longest_px, most_defocus_px(motion.profile)))
     method, why_not = deblur_method(motion, settings, longest_px)
@@ -253,7 +252,7 @@ class _KnownBlur:
     """Instant that the restored picture shows, as a fraction of each row's exposure."""
     longest_px: float
     """Length of the longest blur path, defocus included."""
-    covariance_px2: NDArray[np.float64]
+    covariance_px2: Array
     """(2, 2) covariance of the blur path."""
     position_std_px: float
     """Standard deviation of the rows' positions after straightening, per axis."""
@@ -267,7 +266,7 @@ class _KnownBlur:
 class _BlurStatistics:
     """Noise and detail measured on a blurred picture, and the expected gain of deblurring it."""
 
-    field: Callable[[NDArray[np.float64]], KernelField]
+    field: Callable[[Array], KernelField]
     spread: KernelSpread | None
     luma: PictureStatistics
     chroma: PictureStatistics
@@ -289,7 +288,7 @@ def _deblurred(
 ) -> tuple[NDArray[Any], Deblurring | None, tuple[str, ...]]:
     """The deblurred picture, not rounded, and how it was made; or the picture as recorded, and why."""
     as_shown, picture = picture, picture if unmasked is None else unmasked
-    curve, light = blur.motion.profile.response or ResponseCurve("srgb"), blur.light
+    curve, light = blur.motion.profile.curve, blur.light
     measured = _blur_statistics(picture, blur, settings, confirmed)
     why_not = no_gain_reason(measured.luma_model, measured.expected_db)
     if why_not:
@@ -323,7 +322,7 @@ def _blur_statistics(
 ) -> _BlurStatistics:
     """Statistics and kernels of a picture (height, width, 3)."""
     height, width = picture.shape[:2]
-    curve = blur.motion.profile.response or ResponseCurve("srgb")
+    curve = blur.motion.profile.curve
     centres_px = most_blurred(blur.motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
     few = settings.iterations <= FEW_ITERATIONS
     # with few iterations and an uncertain path, the path's error counts as noise instead: the coder's is no bound

@@ -7,13 +7,11 @@ support it.  A stated value is kept, but a step that the observed motion says wo
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation.kernels import blur_chords
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import straightened_points
-
-Array = NDArray[np.float64]
 
 GRID = 5
 """Grid points in each direction at which two motions are compared."""

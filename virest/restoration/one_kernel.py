@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.response import ResponseCurve
 from virest.errors import SettingsError
 from virest.image_formation.blur import tile_grid
@@ -20,7 +21,6 @@ from virest.restoration.shutter import rounded
 from virest.restoration.statistics.measure import measure_picture
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX
 
-Array = NDArray[np.float64]
 LEAST_PART = 1e-6
 """Kernel values below this fraction of the largest count as 0."""
 SAMPLES = 64

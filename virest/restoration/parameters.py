@@ -6,10 +6,9 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.image_formation.blur import tile_grid
 from virest.image_formation.kernels import angle_and_length, blur_chords
 from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROW_START
@@ -177,18 +176,18 @@ def degradation_parameters(motion: RowMotion, trajectory: Trajectory) -> Degrada
             corners_px=tuple(_numbers(corner) for corner in corners),
             max_displacement_px=float(np.linalg.norm(corners - corner_points(width, height), axis=1).max()),
         ),
-        (profile.response or ResponseCurve("srgb")).describe(),
+        profile.curve.describe(),
     )
 
 
 def unknown_parameters(profile: CameraProfile) -> DegradationParameters:
     """Parameters of a frame whose motion is unknown."""
     readout_s = profile.shutter.readout_time_s if profile.readout_known else None
-    response = (profile.response or ResponseCurve("srgb")).describe()
+    response = profile.curve.describe()
     return DegradationParameters(ExposureMotion(), None, "none", FrameBlur(), FrameShutter(readout_s), response)
 
 
-def _numbers(vector: NDArray[np.float64]) -> Numbers:
+def _numbers(vector: Array) -> Numbers:
     return tuple(vector.tolist())
 
 

@@ -12,8 +12,8 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable, integrate_motion
@@ -32,7 +32,6 @@ from virest.restoration.conflict_causes import CAUSES, TWINS, Cause
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 CONTRADICTED = 1.3
 """Robust residual, in units of the tracking noise, above which the model is wrong.  Correct profiles leave 0.9 to 1.15
 (simulated captures, hand-held and walking); a stabiliser that cancels 10 %, or a focal length 2 % off, leave more than
@@ -181,7 +180,7 @@ class _Search:
         depth_m = self.given.depth_m
         return start_scene(self.imu, known, self.table, 1 / depth_m if depth_m else START_INVERSE_DEPTH_PER_M)
 
-    def fit(self, start: _Start, use: NDArray[np.bool_] | None = None) -> TrackFit:
+    def fit(self, start: _Start, use: Mask | None = None) -> TrackFit:
         """Fit the nuisances and the causes; use: (n,) fit these points only, without covariances."""
         table = self.table if use is None else self.table.chosen(use)
         terms = (*self.nuisances, *(cause.term for cause in start.causes))
@@ -264,7 +263,7 @@ class _Search:
             distance[~seen] = distances(self.imu, own, self.table, fit.depth_spread_per_m)[~seen]
         return distance
 
-    def _block(self) -> NDArray[np.intp]:
+    def _block(self) -> Index:
         """(n,) index of each point's time block."""
         return even_blocks(self.table.pair, self.table.n_pairs, min(BLOCKS, self.table.n_pairs))
 

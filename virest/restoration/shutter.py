@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import (
     PIXELS_WITHIN_PX,
@@ -32,7 +33,7 @@ def rowwise_map(motion: RowMotion, anchor: float, *, undistort: bool = False) ->
     if not undistort:
         return dense_map(motion, anchor)
 
-    def recorded(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def recorded(points: Array) -> Array:
         shown = distorted_points(motion.optics, points, motion.reference_s)
         return seen_by_rows(motion, shown, motion.reference_s, anchor, PIXELS_WITHIN_PX)
 
@@ -114,5 +115,5 @@ def valid_rectangle(source_px: NDArray[np.float32], step: int = 4) -> tuple[int,
     return int(columns[x0]), int(rows[y0]), int(columns[x1 - 1]) + 1, int(rows[y1 - 1]) + 1
 
 
-def _every(length: int, step: int) -> NDArray[np.intp]:
+def _every(length: int, step: int) -> Index:
     return np.append(np.arange(0, length - 1, step), length - 1)

@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation.blur import Image
 from virest.restoration import tiles
 from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
@@ -17,7 +17,6 @@ from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.on_tiles import on_spectrum, packed, packed_frequency
 from virest.restoration.statistics.records import PictureStatistics
 
-Array = NDArray[np.float64]
 Surroundings = tuple[float, int, int]
 """Fraction of the overlap that the margin is reduced by, least margin, px, and least bridge, px."""
 FULL_MARGIN, THIN_MARGIN, THINNEST_MARGIN = (0.0, 16, 16), (0.3, 4, 16), (0.3, 3, 12)

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.camera.response import ResponseCurve
 from virest.image_formation.blur import Image, tile_grid
 from virest.image_formation.kernel_spread import kernel_spread
 from virest.image_formation.kernels import blur_chords, smooth_field
@@ -46,7 +45,7 @@ def try_restoration(
     longest_px = float(equivalent_length_px(longest_px, most_defocus_px(motion.profile)))
     if deblur_method(motion, settings, longest_px)[0] == "none":
         return None
-    curve, field = motion.profile.response or ResponseCurve("srgb"), smooth_field(motion, ANCHOR)
+    curve, field = motion.profile.curve, smooth_field(motion, ANCHOR)
     statistics = picture_statistics(luma, field(most_blurred(motion, centres_px)), curve, FEW_TILES, coding_step)
     covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
     spread = kernel_spread(field, width, height, covariance_px2)

@@ -11,12 +11,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.intrinsics import Intrinsics
 from virest.errors import SettingsError
 from virest.motion.optics import MovingLens
 from virest.restoration.row_chunks import bands
 
-Array = NDArray[np.float64]
 MARGIN_PX = 16
 """A lens must be invertible this far around the picture, since the grid of a map extends beyond it."""
 WITHIN_PX = 0.1

@@ -16,9 +16,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from virest.arrays import Array, Index
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
@@ -36,8 +36,6 @@ from virest.motion.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 CELLS_ROUND, CELLS_OUT, CELLS = 12, 3, 5
 """Cells with correlated errors: sectors and rings about the centre.  CELLS: cells along each side, whose widths are
 compared over time."""

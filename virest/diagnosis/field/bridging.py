@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from virest.arrays import Array, Mask
 from virest.camera.field import AXES, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
@@ -30,8 +30,6 @@ from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.track_fit import Term, TrackFit, for_table, start_scene
 from virest.motion.scene_motion import InertialMotion
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 LEAST_PAIRS_LEFT = 20
 """Minimum number of frame pairs without a doubtful interval that the ladder needs."""
 MAX_P = 1e-3

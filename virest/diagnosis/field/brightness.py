@@ -11,20 +11,17 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 
+from virest.arrays import Array, Index
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.diagnosis.field.screening import MAX_P, MIN_T, RIVAL_GAIN_FRACTION, Design, score_forms
 from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
 from virest.inference.chance import t_ratio
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 KNOTS, FINE_KNOTS = 4, 7
 FINER_LEFT = 0.98
 """A finer map must reduce the held-out residual of the coarser one below this fraction."""
@@ -249,7 +246,7 @@ def _tangent(seen: PhotometricObservations, profile: CameraProfile, at: Predicti
     """Effects of vignetting, a gain per frame and the curve (n, m), grey levels."""
     frames = (seen.frame[:, None] == seen.frames[None, : len(seen.frames) * gains]).astype(float)
     factors = -at.respond(np.concatenate([(seen.radius**2)[:, None], frames], axis=1))
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     changed = (
         replace(curve, extra_gamma=curve.extra_gamma * (1 + CURVE_STEP)),
         replace(curve, black_level=curve.black_level + CURVE_STEP),

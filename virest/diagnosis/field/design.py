@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import varies
@@ -18,7 +18,6 @@ from virest.inference.term import Term, slopes_of
 from virest.inference.track_fit import TrackFit
 from virest.motion.scene_motion import DirectedMotion
 
-Array = NDArray[np.float64]
 STABILISER_CUTOFFS_HZ = (0.3, 1.0, 4.0)
 NAMED = (
     terms_of.TIME_OFFSET,

@@ -11,16 +11,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
 
+from virest.arrays import Array
 from virest.camera.field import FORCES, KINDS, RATES, Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
 
-Array = NDArray[np.float64]
 ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5
 FINE_ROW_KNOTS, FINE_PLACE_KNOTS, FINE_RATE_KNOTS = 21, 7, 13
 MOST_KNOTS, MOST_PLACE_KNOTS, MOST_RATE_KNOTS = 41, 10, 25

@@ -6,14 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import FORCES, RATES, Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.image_formation.point_model import TrackTable
 from virest.inference.track_fit import Term
 
-Array = NDArray[np.float64]
 Moved = Callable[[CameraProfile], Array]
 Recipe = Callable[[CameraProfile, frozenset[str]], "FieldForm"]
 """Builds a form from a profile and the names of the terms in the model."""

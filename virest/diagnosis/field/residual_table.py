@@ -12,16 +12,14 @@ from functools import reduce
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.camera.field import Field, cardinal_weights
 from virest.diagnosis.field.screening import MAX_P, Design, score_forms, select
 from virest.diagnosis.field.words import PATTERNS, SAMPLES, curve_shape, lens_words, shape_of, shape_of_pair
 from virest.errors import CaptureError
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 NEEDED = ("x", "y", "dx", "dy")
 VELOCITY = ("vx", "vy")
 ORDER = ("frame", "time")

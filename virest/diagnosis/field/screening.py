@@ -16,13 +16,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from virest.arrays import Array, Index
 from virest.inference.chance import t_ratio
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 FLIPS, DRAWS = 500, 60
 CLOSE_P, MANY_FLIPS, FLIPS_AT_ONCE = 0.1, 200_000, 20_000
 """A p value between MAX_P and CLOSE_P is counted over MANY_FLIPS flips: an effect in all blocks makes the flipped

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals, point_residuals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
@@ -38,8 +38,6 @@ from virest.inference.track_fit import Term, TrackFit
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 MAX_FIELDS = 3
 SEARCH_POINTS, JUDGE_POINTS = 6000, 4000
 PAIRS_IN_BLOCK = 3

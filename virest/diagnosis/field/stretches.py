@@ -9,17 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from virest.arrays import Array, Mask
 from virest.camera.field import AXES, Field
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.field.forms import FieldForm
 from virest.inference.doubtful_log import Stretch
 from virest.inference.observed_tracks import ObservedTracks
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 KNOT_STEP_S = 0.015
 """Knot spacing of a bridge.  What a clipped peak lacks starts with a kink between two readings: over the peaks of a
 hand at 1 to 2 rad/s, the angle of a spline with this spacing errs by 0.1 mrad in the median and 0.3 mrad at most, about

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from virest.arrays import Array
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, step_forms
@@ -19,7 +19,6 @@ from virest.diagnosis.field.forms import FieldForm
 from virest.image_formation.point_model import seen_s
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
-Array = NDArray[np.float64]
 FALSE_ALARM_RATE = 1e-4
 """Family-wise false-alarm rate over all pairs of a capture."""
 LEAST_POINTS, LEAST_PAIRS = 8, 15

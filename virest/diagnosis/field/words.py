@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.field import FORCES, KINDS, RATES, UNIT_SCALES, Field
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
@@ -17,7 +17,6 @@ from virest.diagnosis.field.stretches import axis_names
 from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
 from virest.inference.doubtful_log import CLIPPED
 
-Array = NDArray[np.float64]
 MIN_EXPLAINED = 0.95
 """Part of a field's variance that a shape must explain to name it."""
 STEP_SPAN, STEP_PART = 0.25, 0.8

@@ -14,12 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.inference.chance import student_deviation
 from virest.restoration.statistics.records import Misplaced
 
-Array = NDArray[np.float64]
 LEAST_PAIRS = 2
 """A single pair has no scatter."""
 LEAST_SEEN_DB = 0.1

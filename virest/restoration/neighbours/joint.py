@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import KernelSpread
 from virest.image_formation.kernels import KernelField
@@ -28,7 +29,6 @@ from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 from virest.restoration.statistics.tile_power import passed_power
 
-Array = NDArray[np.float64]
 OWN_ERROR = 0.01
 """Part of the signal's power that differs between any two frames: the tone curve acts on different blurs."""
 MOST_DIFFERENT = 4.0
@@ -102,7 +102,7 @@ class NeighbourRegistration:
     """The frame's noise over the neighbour's, 0 to 1, at the reduced size."""
     alike: Image
     """How surely it shows the same as the frame, 0 to 1, at the reduced size."""
-    seen: NDArray[np.bool_]
+    seen: Mask
     """Where the neighbour has unclipped pixels, at the reduced size."""
     std_px: Array
     """(n,) standard deviation of the registration in those tiles, per axis."""
@@ -331,7 +331,7 @@ def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array
     return found, typical
 
 
-def _shift_field(agreement: TileAgreement, used: NDArray[np.bool_]) -> tuple[ShiftField, float, Array]:
+def _shift_field(agreement: TileAgreement, used: Mask) -> tuple[ShiftField, float, Array]:
     """The shifts over the picture, the tiles' noise per axis, px, and the field's deviation (n,) per axis, px.
 
     Affine, plus what adjacent tiles share: a rest of the stabiliser, rolling-shutter wobble, relief.  That part is

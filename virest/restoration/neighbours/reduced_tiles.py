@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from virest.arrays import Array, Index
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import KernelField
 
-Array = NDArray[np.float64]
 TILE = 64
 """Side of a compared tile, reduced pixels."""
 SHORT_SIDE = 400
@@ -72,7 +72,7 @@ def power_of(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
     return spectra.real**2 + spectra.imag**2
 
 
-def spread_tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.intp]:
+def spread_tiles(height: int, width: int, most: int = MOST_TILES) -> Index:
     """(n, 2) top and left of at most ``most`` tiles, evenly spaced over a picture.
 
     With ``most`` above MOST_TILES, tiles overlap where needed to cover the picture completely.
@@ -88,13 +88,13 @@ def spread_tiles(height: int, width: int, most: int = MOST_TILES) -> NDArray[np.
     return np.asarray(corners[chosen])
 
 
-def full_px(tops_lefts: NDArray[np.intp], times: int, at: float) -> Array:
+def full_px(tops_lefts: Index, times: int, at: float) -> Array:
     """(n, 2) x, y in the recorded picture of the point ``at`` rows and columns into each reduced tile."""
     return np.asarray((tops_lefts[:, ::-1] + at + 0.5) * times - 0.5)
 
 
 def kernel_spectra(
-    field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: int
+    field: Callable[[Array], KernelField], tops_lefts: Index, times: int
 ) -> NDArray[np.complex64] | None:
     """Spectra of the transposed kernels at tiles' centres, (n, WIDE, WIDE / 2 + 1); a product applies the blur.
 
@@ -109,12 +109,12 @@ def kernel_spectra(
     return np.asarray(fft.fft(rows, WIDE, axis=1) * down[:, None])
 
 
-def cut(picture: NDArray[Any], tops_lefts: NDArray[np.intp], side: int = TILE) -> NDArray[Any]:
+def cut(picture: NDArray[Any], tops_lefts: Index, side: int = TILE) -> NDArray[Any]:
     """Tiles (n, side, side) of a picture."""
     return np.stack([picture[top : top + side, left : left + side] for top, left in tops_lefts.tolist()])
 
 
-def wide_spectra(picture: Image, tops_lefts: NDArray[np.intp]) -> NDArray[np.complex64]:
+def wide_spectra(picture: Image, tops_lefts: Index) -> NDArray[np.complex64]:
     """Spectra (n, WIDE, WIDE / 2 + 1) of tiles with their margins; the picture is mirrored at its edges."""
     padded = cv2.copyMakeBorder(picture, AROUND, AROUND, AROUND, AROUND, cv2.BORDER_REFLECT_101)
     return np.asarray(fft.rfft2(cut(padded, tops_lefts, WIDE)))
@@ -161,7 +161,7 @@ def radii(side: int = TILE) -> Array:
 
 
 @lru_cache(maxsize=1)
-def _fitted_phases() -> tuple[NDArray[np.intp], NDArray[np.float32], tuple[int, ...]]:
+def _fitted_phases() -> tuple[Index, NDArray[np.float32], tuple[int, ...]]:
     """Flat indices into half a spectrum of the m phases to fit, by increasing frequency, and 2π f there, (2, m).
 
     The third: how many of them lie below each of CUTOFFS.

@@ -12,15 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.image_formation.neighbour import turn_jacobian_px
 from virest.image_formation.row_motion import FurtherTurn, RowMotion
 from virest.inference.chance import chi2_median, chi2_tail
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.registration import PairTurn
 
-Array = NDArray[np.float64]
 FALSE_ALARM = 1e-3
 """Probability of correcting a correct prediction."""
 NEGLIGIBLE_PX = 0.05

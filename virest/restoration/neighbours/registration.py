@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import KernelField, smooth_field
 from virest.image_formation.neighbour import NeighbourView, turn_jacobian_px
@@ -39,7 +39,6 @@ from virest.restoration.neighbours.reduced_tiles import (
     wide_spectra,
 )
 
-Array = NDArray[np.float64]
 LEAST_TILES = 4
 """A rotation has three unknowns and a tile's shift gives two equations; fewer tiles leave too little redundancy."""
 FAR_PX = 3.0
@@ -77,7 +76,7 @@ class PairTurn:
 class FrameTiles:
     """Tiles of a reduced frame and their kernels, to be compared with those of its neighbours."""
 
-    tops_lefts: NDArray[np.intp]
+    tops_lefts: Index
     """(n, 2) positions in the reduced picture."""
     times: int
     """Recorded size over reduced size."""
@@ -141,7 +140,7 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
 class TileAgreement:
     """Comparison of a neighbour's tiles with a frame's, each blurred along the other's path."""
 
-    tops_lefts: NDArray[np.intp]
+    tops_lefts: Index
     """(n, 2) positions in the reduced picture."""
     centres_px: Array
     """(n, 2) tile centres in the frame."""
@@ -157,9 +156,9 @@ class TileAgreement:
     """The neighbour's light over the frame's."""
     light: float
     """The frame's light, median of the tiles."""
-    inside: NDArray[np.bool_]
+    inside: Mask
     """At the reduced size: where the neighbour covers the frame."""
-    clipped: NDArray[np.bool_]
+    clipped: Mask
     """At the reduced size: where clipped light of either frame may reach."""
     blur_px: int
     """Half the neighbour's longest blur path, reduced pixels, at most TILE / 4."""
@@ -168,7 +167,7 @@ class TileAgreement:
     times: int
     """Recorded size over reduced size."""
 
-    def differences(self, shift_px: Array, numbers: NDArray[np.intp] | slice = slice(None)) -> Image:
+    def differences(self, shift_px: Array, numbers: Index | slice = slice(None)) -> Image:
         """The neighbour's tiles minus the frame's shifted by shift_px (n, 2): (n, TILE, TILE), light over its mean.
 
         numbers: indices of the tiles.
@@ -192,7 +191,7 @@ class TileAgreement:
         return cv2.copyMakeBorder(inner, *(self.blur_px,) * 4, cv2.BORDER_REFLECT)
 
     @property
-    def wholly_seen(self) -> NDArray[np.bool_]:
+    def wholly_seen(self) -> Mask:
         """(n,) whether the neighbour covers all of a tile."""
         seen = self.inside.astype(np.float32)
         return np.asarray(cut(seen, self.tops_lefts).min(axis=(1, 2)) > 0)
@@ -249,7 +248,7 @@ def tile_agreement(
     )
 
 
-def _reach_px(field: Callable[[Array], KernelField], tops_lefts: NDArray[np.intp], times: int) -> int:
+def _reach_px(field: Callable[[Array], KernelField], tops_lefts: Index, times: int) -> int:
     """Half the longest path of a neighbour's kernels, reduced pixels, rounded up."""
     centres_px = full_px(tops_lefts, times, (TILE - 1) / 2)
     return int(np.ceil(0.5 * field(centres_px).length_px.max() / times))
@@ -297,13 +296,13 @@ def judged_change(
 
 def _levels_per_part(tiles: Image, profile: CameraProfile) -> Image:
     """Grey levels per unit of light over the tile's mean, (n, 1, 1)."""
-    curve = profile.response or ResponseCurve("srgb")
+    curve = profile.curve
     light = tiles.mean(axis=(1, 2), keepdims=True)
     grey = np.rint(255 * curve.encode(light)).astype(np.uint8)
     return np.asarray(light * curve.slope_table()[grey], np.float32)
 
 
-def _inside(source: NDArray[np.float32], second: Image) -> NDArray[np.bool_]:
+def _inside(source: NDArray[np.float32], second: Image) -> Mask:
     """Where a map (h, w, 2) points inside the neighbour's picture."""
     height, width = second.shape
     return np.asarray(cv2.inRange(source, (-0.5, -0.5), (width - 0.5, height - 0.5)) > 0)
@@ -327,9 +326,7 @@ def _registered(view: NeighbourView, second: Image, times: int, apart: Array) ->
     return read_at(second, view.map_px(lambda p: p - times * apart, times))
 
 
-def _turn(
-    view: NeighbourView, tops_lefts: NDArray[np.intp], times: int, shift: Array, precision: Array
-) -> PairTurn | None:
+def _turn(view: NeighbourView, tops_lefts: Index, times: int, shift: Array, precision: Array) -> PairTurn | None:
     """Fit one rotation rate to the tiles' shifts with Huber's weights; None: too few tiles, or ill-conditioned."""
     used = precision > 0
     if np.count_nonzero(used) < LEAST_TILES:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.capture.pixels import BT601_LUMA
@@ -105,7 +106,7 @@ class FrameNeighbours:
         self._trajectory, self._lens, self._missing = trajectory, lens, missing
         self._light: dict[int, Image] = {}
         self._full: dict[int, tuple[Image, Image]] = {}
-        self._passed: dict[int, NDArray[np.float64]] = {}
+        self._passed: dict[int, Array] = {}
         self._turns: dict[int, PairTurn | None] = {}
 
     def refined(self, before: Sequence[Sight], here: Sight, after: Sequence[Sight]) -> RefinedMotion | None:
@@ -127,7 +128,7 @@ class FrameNeighbours:
         refined: RefinedMotion | None,
         most: int,
         luma: PictureStatistics,
-        field: Callable[[NDArray[np.float64]], KernelField],
+        field: Callable[[Array], KernelField],
     ) -> tuple[NeighbourPicture, ...]:
         """Register at most ``most`` of a frame's neighbours, chosen by how much they reduce the ideal filter's error.
 
@@ -174,7 +175,7 @@ class FrameNeighbours:
         """Register a neighbour to the frame; None if it shows different content or its path is too long."""
         assert here.motion is not None
         assert other.motion is not None
-        curve, further = here.motion.profile.response or ResponseCurve("srgb"), refined.further if refined else None
+        curve, further = here.motion.profile.curve, refined.further if refined else None
         view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, further=further)
         along = view.field()
         agreement = tile_agreement(view, tiles, along, self.light(other))
@@ -217,7 +218,7 @@ class FrameNeighbours:
             self._light[sight.frame.index] = light_of(sight)
         return self._light[sight.frame.index]
 
-    def _passed_of(self, sight: Sight, here: Sight) -> NDArray[np.float64]:
+    def _passed_of(self, sight: Sight, here: Sight) -> Array:
         """(RINGS,) mean |K|² over a neighbour's picture, times the typical weight at its distance from the frame."""
         assert sight.motion is not None
         if sight.frame.index not in self._passed:
@@ -254,13 +255,13 @@ def light_of(sight: Sight) -> Image:
     """A frame's luma in linear light, reduced."""
     assert sight.motion is not None
     luma = sight.picture if sight.picture.ndim == 2 else cv2.cvtColor(sight.picture, cv2.COLOR_RGB2GRAY)
-    return reduced_light(luma, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
+    return reduced_light(luma, _linear(sight.motion.profile.curve))
 
 
 def _luma_and_half(sight: Sight) -> tuple[Image, Image]:
     """Luma of a frame's linear light, (height, width), and its light at half the size, (height / 2, width / 2, 3)."""
     assert sight.motion is not None
-    light = cv2.LUT(sight.picture, _linear(sight.motion.profile.response or ResponseCurve("srgb")))
+    light = cv2.LUT(sight.picture, _linear(sight.motion.profile.curve))
     weights = np.array([BT601_LUMA], np.float32)
     return np.asarray(cv2.transform(light, weights), np.float32), half_size(light)
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from virest.arrays import Picture
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import blur_chords
 from virest.image_formation.neighbour import neighbour_view
@@ -25,7 +25,6 @@ MOST_RUNS = 4
 TELLING_PX = 3.0
 """Blur paths of this length cancel ⅓ cycle per pixel; frames are compared up to ¼.  On eleven simulated captures 36 of
 38 shares of frames with longer paths were positive, against 12 of 40 for paths of 1 to 2.5 px."""
-Picture = NDArray[np.uint8]
 
 
 def survey_runs(numbers: Iterable[int], path_px: Mapping[int, float]) -> list[tuple[int, ...]]:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Index
 from virest.camera.response import ResponseCurve
 from virest.capture.pixels import BT601_LUMA
 from virest.image_formation.kernels import KernelField
@@ -114,8 +115,8 @@ def _planes(picture: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
     return (picture,) if picture.ndim == 2 else tuple(cv2.split(cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb)))
 
 
-def _most_colourful(parts: Sequence[tuple[NDArray[np.uint8], ...]]) -> tuple[NDArray[np.intp], float]:
-    """Indices, ascending, of the half of the tiles whose colours vary most, and all tiles' mean variance over theirs.
+def _most_colourful(parts: Sequence[tuple[NDArray[np.uint8], ...]]) -> tuple[Index, float]:
+    """Index, ascending, of the half of the tiles whose colours vary most, and all tiles' mean variance over theirs.
 
     The others hold little colour, and a filter that is optimal for them would remove the colour of these.
     """
@@ -132,7 +133,7 @@ def _minus_impulse(kernel: NDArray[np.float32]) -> NDArray[np.float32]:
     return left
 
 
-def _ring_means(cells: RingCells, values: NDArray[np.float32]) -> NDArray[np.float64]:
+def _ring_means(cells: RingCells, values: NDArray[np.float32]) -> Array:
     """(RINGS,) mean of values over each ring's cells; ½ in empty rings."""
     count = cells.count.sum(axis=1)
     return np.where(count > 0, (cells.count * cells.means(values)).sum(axis=1) / np.maximum(count, 1), 0.5)
@@ -152,10 +153,8 @@ def _luma_light(tile: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.flo
     return np.asarray(cv2.transform(light, np.array([BT601_LUMA], np.float32)))
 
 
-def _least_clipped(
-    clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]], most_tiles: int
-) -> NDArray[np.intp]:
-    """Indices of at most ``most_tiles`` tiles to measure, evenly spaced among those with the least clipped light."""
+def _least_clipped(clipped: NDArray[np.uint8] | None, corners: list[tuple[int, int]], most_tiles: int) -> Index:
+    """Index of at most ``most_tiles`` tiles to measure, evenly spaced among those with the least clipped light."""
     chosen = np.arange(len(corners))
     if clipped is not None:
         parts = np.array([np.count_nonzero(cut(clipped, corner)) for corner in corners]) / SIDE**2

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.camera.response import ResponseCurve
 from virest.image_formation.kernels import KernelField, blur_chords
 from virest.image_formation.row_motion import RowMotion
@@ -32,7 +33,7 @@ _LEAST_FALL = 2.0
 """Least exponent of the fall of picture power with frequency: f⁻² is that of edges alone, without texture."""
 
 
-def most_blurred(motion: RowMotion, centres_px: NDArray[np.float64]) -> NDArray[np.float64]:
+def most_blurred(motion: RowMotion, centres_px: Array) -> Array:
     """Centres (m, 2) of the tiles to measure: the MIN_SAMPLES most blurred, and all with half the longest path or more.
 
     A path of 1 px cancels no frequency, so it cannot separate noise from signal; and coding noise is where motion is.
@@ -79,7 +80,7 @@ def picture_statistics(
     return luma, chroma
 
 
-def without_defocus(defocused: PictureStatistics, sigma_px: float | NDArray[np.float64]) -> PictureStatistics:
+def without_defocus(defocused: PictureStatistics, sigma_px: float | Array) -> PictureStatistics:
     """Spectra of the picture before Gaussian defocus; sigma_px: one value, or (n,) for the measured tiles.
 
     The Gaussian leaves almost nothing of high frequencies, so dividing by it there gives no valid spectrum.  No scene's

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.restoration.statistics.records import Array, PictureStatistics
+from virest.arrays import Array, Index
+from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.rings import RINGS, SIDE
 
 
@@ -70,7 +71,7 @@ def _spectrum_coordinates(size: int, scale: float) -> tuple[NDArray[np.float32],
 
 
 @lru_cache(maxsize=8)
-def _between_rings(size: int, scale: float) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.float32]]:
+def _between_rings(size: int, scale: float) -> tuple[Index, NDArray[np.float32], NDArray[np.float32]]:
     """For each packed value: ring below it, fraction of the way to the next, and factor f² below the lowest ring."""
     position = packed_frequency(size) / scale * (RINGS / 0.5) - 0.5
     held = np.clip(position, 0, RINGS - 1)

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array
 from virest.capture.pixels import BT601_LUMA
 from virest.image_formation.kernel_spread import KernelSpread
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 
-Array = NDArray[np.float64]
 LUMA_RED, LUMA_GREEN, LUMA_BLUE = BT601_LUMA
 PER_COLOUR_POWER = sum((2 * (1 - own)) ** 2 * (1 + (own / LUMA_GREEN) ** 2) / 3 for own in (LUMA_RED, LUMA_BLUE))
 """Mean square over red, green and blue of what errors of Cr and Cb make, over the mean of their powers: 1.91.

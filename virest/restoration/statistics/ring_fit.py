@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from virest.arrays import Array, Mask
 from virest.restoration.statistics.records import (
     ROUNDING_POWER,
-    Array,
     PictureStatistics,
     coder_noise,
     falling_power,
@@ -120,7 +120,7 @@ def _final_statistics(
     noise: Array,
     passed: Array,
     observed: Array,
-    determined: NDArray[np.bool_],
+    determined: Mask,
     white_levels: float,
     step: float | None,
 ) -> PictureStatistics:
@@ -169,7 +169,7 @@ def _falling_noise(frequency: Array, finest: float, slope: float) -> Array:
     return np.asarray(max(finest, ROUNDING_POWER) * (frequency[-2] / np.maximum(frequency, _LEVEL_BELOW)) ** slope)
 
 
-def _low_frequency_growth(frequency: Array, noise: Array, determined: NDArray[np.bool_], observed: Array) -> Array:
+def _low_frequency_growth(frequency: Array, noise: Array, determined: Mask, observed: Array) -> Array:
     """Factor on the noise, (RINGS,), below the determined rings: it continues at the slope of the determined ones.
 
     Sensor noise is white.  Coding noise falls with the picture's power where the coder drops it; at lower frequencies,
