@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from story import Result, process, psnrs_db, simulate
 
 pytestmark = pytest.mark.scenario
@@ -53,3 +54,18 @@ def test_a_right_profile_is_not_contradicted(virest, work: Path, scene: str, see
     result = process(virest, capture, work / "stated-right-run", "--preset", "fast")
     assert not said(result, "the pictures")
     assert not any("disagrees with the profile" in reason for reason in reasons(result))
+
+
+def test_axes_of_another_phone_are_named_and_nothing_is_restored_by_them(virest, work: Path):
+    """Whatever travel would make the points fit: the frames rotate as the gyroscope, but about other axes."""
+    options = "--width 480 --height 360 --frames 60 --rate 0.8 --exposure-ms 14 --depth-m 0.5 --seed 29"
+    capture = simulate(virest, work / "other-axes", *options.split())
+    profile = yaml.safe_load((capture / "camera.yaml").read_text())
+    pose = np.array(profile["imu"]["T_cam_imu"])
+    profile["imu"] |= {"T_cam_imu": (np.diag([1, -1, 1, 1]) @ pose[[1, 0, 2, 3]]).tolist(), "time_offset_s": None}
+    turned = work / "other-axes.yaml"
+    turned.write_text(yaml.safe_dump(profile))
+    result = process(virest, capture, work / "other-axes-run", "--preset", "fast", "--config", turned)
+    assert {line["status"] for line in result.lines} == {"copied"}
+    assert said(result, "axes are not the profile's")
+    assert "virest calibrate" in result.stderr

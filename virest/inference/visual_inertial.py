@@ -55,6 +55,8 @@ MAX_UNEXPLAINED = 0.15
 MAX_SPREAD = 0.6
 """Largest spread of inverse depths about the plane relative to its inverse depth."""
 GRAVITY_TOLERANCE_M_S2 = 0.7
+"""Largest error of the fitted gravity's magnitude beside two of its standard deviations: an accelerometer is off by its
+bias and scale."""
 ROTATION_ITERATIONS = 8
 """The fit with rotation alone serves only for comparison and needs no full convergence."""
 STATED_DEPTH_STD = 0.02
@@ -243,8 +245,7 @@ def _judged(stretch: Stretch, rotating: TrackFit, window: int, depth_m: float | 
         start_s, end_s, scale_std, float(spread) / speed, before / max(left, 1e-6), left, "",
         fit.depth_spread_per_m / inverse, float(flow_std),
     )  # fmt: skip
-    gravity = float(np.linalg.norm(stretch.scene.gravity_m_s2))
-    reason = _no_parallax(found) or _no_fit(found, gravity, before) or _far_from_profile(fit)
+    reason = _no_parallax(found) or _no_fit(found, *_gravity_m_s2(stretch), before) or _far_from_profile(fit)
     if reason:
         return replace(found, reason=reason)
     return replace(found, reason=_no_metres(found), over_depth=found.flow_std < MAX_FLOW_STD)
@@ -261,12 +262,21 @@ def _no_parallax(found: Window) -> str:
     return ""
 
 
-def _no_fit(found: Window, gravity_m_s2: float, before: float) -> str:
+def _gravity_m_s2(stretch: Stretch) -> tuple[float, float]:
+    """Magnitude of the fitted gravity, and its standard deviation."""
+    gravity, first = stretch.scene.gravity_m_s2, len(stretch.fit.change)
+    size = float(np.linalg.norm(gravity))
+    up = gravity / max(size, 1e-9)
+    return size, float(np.sqrt(max(up @ stretch.fit.covariance[first : first + 3, first : first + 3] @ up, 0.0)))
+
+
+def _no_fit(found: Window, gravity_m_s2: float, std_m_s2: float, before: float) -> str:
     unexplained = max(found.residual**2 - 1, 0.0) / max(before**2 - 1, 1e-6)
-    if unexplained > MAX_UNEXPLAINED or abs(gravity_m_s2 - GRAVITY_M_S2) > GRAVITY_TOLERANCE_M_S2:
+    too_far_m_s2 = float(np.hypot(GRAVITY_TOLERANCE_M_S2, 2 * std_m_s2))
+    if unexplained > MAX_UNEXPLAINED or abs(gravity_m_s2 - GRAVITY_M_S2) > too_far_m_s2:
         return (
             f"the accelerometer does not fit the frames: {unexplained:.0%} of the parallax unexplained, "
-            f"gravity {gravity_m_s2:.2f} m/s²"
+            f"gravity {gravity_m_s2:.2f} ± {std_m_s2:.2f} m/s²"
         )
     return ""
 

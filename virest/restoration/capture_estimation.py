@@ -115,6 +115,8 @@ def _planned(
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
         plan = _with_estimates(plan, capture.imu, observe_tracks(capture, tracked, profile))
+    if plan.refuses(NoteCode.OTHER_AXES):
+        return plan
     alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
