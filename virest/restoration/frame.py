@@ -325,11 +325,11 @@ def _blur_statistics(
     curve = blur.motion.profile.curve
     centres_px = most_blurred(blur.motion, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px)
     few = settings.iterations <= FEW_ITERATIONS
-    # with few iterations and an uncertain path, the path's error counts as noise instead: the coder's is no bound
+    # with few iterations and an uncertain path, the path's error counts as noise: the coder's is no upper bound
     bounds_luma = not (few and blur.covariance_px2.any())
     field, most_tiles = smooth_field(blur.motion, blur.anchor), FEW_TILES if few else MANY_TILES
     luma, chroma = picture_statistics(picture, field(centres_px), curve, most_tiles, blur.coding_step, bounds_luma)
-    if few and bounds_luma and blur.coding_step is not None:
+    if few and blur.coding_step is not None:
         luma = luma.with_coder_noise(blur.coding_step, LEAST_CODER_NOISE)
     spread = kernel_spread(field, width, height, blur.covariance_px2)
     luma_model = luma.with_kernel_variance(spread)
