@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from virest.arrays import Array, Index
 from virest.camera.field import Field, cardinal_weights
@@ -28,7 +27,7 @@ from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
 from virest.diagnosis.local_blur import LENS_SIGMA_PX, LENS_STD_PX, BlurObservations, predicted_blur
 from virest.diagnosis.local_blur_model import fitted_width
 from virest.image_formation.light import defocus_px
-from virest.inference.chance import t_ratio
+from virest.inference.chance import student_tail, t_ratio
 from virest.inference.clustered import scatter
 from virest.inference.descent import Residuals, Slopes, System, descend
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
@@ -223,7 +222,7 @@ def _outlier_frame_p(left: Array, block: Index) -> float:
     mean = np.bincount(block, bounded - np.median(bounded)) / np.sqrt(count)
     spread = max(robust_std(mean - np.median(mean)), float(bounded.std()))
     most = float(np.abs(mean - np.median(mean)).max()) / max(spread, 1e-9)
-    return min(1.0, 2 * len(count) * float(stats.t.sf(most, len(count) - 1)))
+    return min(1.0, 2 * len(count) * student_tail(most, len(count) - 1))
 
 
 def _indistinguishable(best: Scored, other: Scored) -> bool:

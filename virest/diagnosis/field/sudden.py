@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from virest.arrays import Array
 from virest.capture.records import Capture
@@ -17,6 +16,7 @@ from virest.diagnosis.field.design import PointResiduals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, step_forms
 from virest.diagnosis.field.forms import FieldForm
 from virest.image_formation.point_model import seen_s
+from virest.inference.chance import student_tail
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
 FALSE_ALARM_RATE = 1e-4
@@ -55,7 +55,7 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     spread = robust_std(growth - middle)
     most = int(np.argmax(np.abs(growth - middle)))
     ratio = abs(growth[most] - middle) / max(spread, 1e-12)
-    p_value = min(2 * len(pairs) * float(stats.t.sf(ratio, len(pairs) - 1)), 1.0)
+    p_value = min(2 * len(pairs) * student_tail(ratio, len(pairs) - 1), 1.0)
     if p_value > FALSE_ALARM_RATE:
         return None
     inside = table.pair == pairs[most]
