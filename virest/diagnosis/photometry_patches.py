@@ -29,7 +29,7 @@ from virest.inference.tracking import TrackingSettings, find_corners
 from virest.motion.trajectory import Trajectory
 
 PATH_INSTANTS = 13
-"""Instants of a path over the exposure, linear between: 20 ms at 50 rad/s² and 1000 px of focal length err by 0.02 px."""
+"""Instants of a path over the exposure, linear between: 20 ms at 50 rad/s² and f = 1000 px err by 0.02 px."""
 _LK_WINDOW = (21, 21)
 _LK_LEVELS = 3
 HALVE_ABOVE_PX = 1000
