@@ -30,8 +30,6 @@ from virest.motion.trajectory import Trajectory
 
 PATH_INSTANTS = 13
 """Instants of a path over the exposure, linear between: 20 ms at 50 rad/s² and f = 1000 px err by 0.02 px."""
-_LK_WINDOW = (21, 21)
-_LK_LEVELS = 3
 HALVE_ABOVE_PX = 1000
 """Halve frames with a longer side than this first: patches are means over many pixels anyway."""
 PATCH_PX, SURROUND_PX = 11.0, 23.0
@@ -279,7 +277,7 @@ def _deviation(corners: _Corners, frame: Frame, normal: Picture, camera: Turning
     start = np.ascontiguousarray(guess[inside, None], np.float32)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         corners.normal, normal, np.ascontiguousarray(corners.points_px[inside, None]), start.copy(),
-        winSize=_LK_WINDOW, maxLevel=_LK_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     found = status.ravel() == 1
     guess, deviation = guess[inside][found], (moved - start)[found, 0].astype(float)

@@ -21,6 +21,7 @@ from virest.inference.travel_direction import find_directions, without_direction
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 SMALLEST_SCALE = 0.03
+"""Least factor on the tracking noise: points without noise, as in tests, fit better than any that are tracked."""
 STALE = {Slopes.ON_THE_WAY: (1.5, 0.5), Slopes.AT_THE_END: (0.1, 0.05), Slopes.HERE: (0.0, 0.0)}
 """Reuse the Jacobian until points move this far (median, px) or the scene changes by this fraction."""
 ANY_DEPTH = 1e6

@@ -55,7 +55,9 @@ out of focus; excludes the scatter from the number of edges.  ``python -m virest
 others.  The largest are 0.009, of a board at 320 x 240, and 0.025.  The profile to which the mask is fitted may be off
 by the same standard deviation as the sharpest edges: neighbours within 1 px share the error."""
 EDGES = EdgeSettings(edges_per_frame=600, cell_px=16, min_slope_levels=6.0)
+"""The smallest step that counts has this slope at a width of 1.7 px, with the search's smoothing 2 px."""
 MOST_FRAMES = 4
+"""Frames that are searched for edges: 600 each, where LEAST_EDGES suffice."""
 STILL_PX = 0.6
 """Edges across which the blur path's standard deviation is below this are used."""
 SHARPEST = 0.4
@@ -72,9 +74,11 @@ EDGES_PER_SAMPLE = 4
 MEDIAN_STD = 1.2533
 """Standard deviation of the median over that of the mean, for normal deviates."""
 ALONG_PX = np.arange(-9.0, 9.0 + 1e-9, 0.5)
+"""Half a pixel apart; beyond FLAT_FROM_PX there are 11 samples of the plateau."""
 FLAT_FROM_PX, MAX_FLAT_RMS = 4.0, 0.04
 """Start of the plateau, and its largest rms relative to the step."""
 MIN_STEP_LEVELS = 30.0
+"""Noise of one grey level is 3 % of it, within MAX_FLAT_RMS."""
 UNCLIPPED_LEVELS = (6.0, 249.0)
 """Range of an unclipped plateau.  The overshoot itself may be clipped, so that the mask is underestimated."""
 MAX_OFF_PX = 1.5

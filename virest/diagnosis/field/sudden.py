@@ -22,10 +22,12 @@ from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 FALSE_ALARM_RATE = 1e-4
 """Family-wise false-alarm rate over all pairs of a capture."""
 LEAST_POINTS, LEAST_PAIRS = 8, 15
+"""Points of a pair whose growth is measured, and pairs among which one may be an outlier."""
 INSTANTS, REACH = 97, FRAMES_PER_STEP + 1.0
 """Number of instants tried, and the search range in frames before and after: the coarse search ignores FRAMES_PER_STEP
 frames around a change, and its instants are off by up to half of that."""
 LEAST_SCALE = 1e-9
+"""Guard against a division by zero."""
 _ITERATIONS = 8
 
 
