@@ -27,8 +27,8 @@ def test_an_empty_group_has_no_larger_mean() -> None:
     assert np.isnan(chance.chance_of_larger(np.ones(4), np.zeros(0)))
 
 
-@pytest.mark.parametrize("module", ["process", "preview", "diagnose", "calibrate", "simulate", "report"])
-def test_no_command_loads_scipy_stats(module: str) -> None:
+def test_no_command_loads_scipy_stats() -> None:
     """It takes a third of a second."""
-    code = f"import sys, virest.app.{module}; sys.exit('scipy.stats' in sys.modules)"
+    modules = ", ".join(f"virest.app.{name}" for name in ("process", "diagnose", "calibrate", "simulate", "report"))
+    code = f"import sys, {modules}; sys.exit('scipy.stats' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
