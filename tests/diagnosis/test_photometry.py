@@ -62,13 +62,13 @@ def made_observations(
     products: float = 0.0,
     pace: float = 0.4,
     exposures_s: tuple[float, ...] = (0.007,),
+    patches: int = 150,
 ) -> PhotometricObservations:
     """Patches that wander through the picture, their grey written down from the contract's model.
 
     products: spread of the logged exposure × ISO, in log light.  pace: of its walk, radians a frame.  exposures_s: of
     the frames, in turn.
     """
-    patches = 150
     frame = np.tile(np.arange(FRAMES), patches)
     patch = np.repeat(np.arange(patches), FRAMES)
     sway = 90 * np.stack([np.sin(0.31 * np.arange(FRAMES)), np.cos(0.17 * np.arange(FRAMES))], axis=-1)
@@ -162,7 +162,7 @@ def named(observed: PhotometricObservations) -> dict[str, PictureVerdict]:
 
 def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(rng: np.random.Generator) -> None:
     """It stands on one side, comes over it for a while, or passes through; a cloud before the sun dims all alike."""
-    observed = made_observations(hidden(), rng)
+    observed = made_observations(hidden(), rng, patches=80)
     x, t = observed.x_px / 639, observed.frame / FRAMES
     side, while_there = 1 / (1 + np.exp(-(x - 0.5) / 0.06)), np.exp(-(((t - 0.5) / 0.2) ** 2))
     one_side = 1 / (1 + np.exp(-(x - 0.6) / 0.06))
@@ -176,7 +176,7 @@ def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(rng: np.ra
 
 def test_a_vignette_keeps_its_name_beside_a_shadow(rng: np.random.Generator) -> None:
     """And nearly its size; the lamps, whose frequency would be that of the frames, are not blamed."""
-    observed = made_observations(hidden(vignetting_corner_loss=0.2), rng)
+    observed = made_observations(hidden(vignetting_corner_loss=0.2), rng, patches=80)
     shade = 1 / (1 + np.exp(-(observed.x_px / 639 - 0.6) / 0.06))
     found = named(dimmed(observed, 1 - 0.2 * shade))
     assert list(found) == ["vignetting"]
@@ -185,7 +185,7 @@ def test_a_vignette_keeps_its_name_beside_a_shadow(rng: np.random.Generator) -> 
 
 def test_a_slope_of_the_light_is_no_gain_that_follows_the_camera(rng: np.random.Generator) -> None:
     """Where all patches move alike the two are the same for patches; the few numbers are told, and the rival is."""
-    observed = made_observations(hidden(), rng)
+    observed = made_observations(hidden(), rng, patches=80)
     found = named(dimmed(observed, 1 - 0.15 * observed.x_px / 639))
     verdict = found["gain_drift"]
     assert verdict.observations is not None
