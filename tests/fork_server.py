@@ -27,6 +27,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, NoReturn
 
+LAZY = ("pandas", "typer._adapters", "pydantic.type_adapter", "matplotlib.figure", "matplotlib.backends.backend_agg")
+"""Modules that the program loads only once a table is read, an option is checked, a figure is drawn."""
 MOST_BYTES = 1 << 20
 """Longest call: arguments and variables."""
 LONGEST_S = 1200.0
@@ -91,12 +93,14 @@ def called(address: str, arguments: list[str], cwd: str, streams: Sequence[IO[st
 
 def serve(address: str) -> None:
     """Fork a program for each call, and answer its status."""
-    importlib.import_module("pandas")  # loaded only once a table is read
+    for name in LAZY:
+        importlib.import_module(name)
     package = importlib.import_module("virest")
     for module in pkgutil.walk_packages(package.__path__, "virest."):
         if not module.name.endswith("__main__"):
             with contextlib.suppress(ImportError):
                 importlib.import_module(module.name)
+    importlib.import_module("virest.app.cli").program()
     gc.freeze()
     with socket.socket(socket.AF_UNIX) as calls:
         calls.bind(address)
