@@ -267,7 +267,8 @@ def _gravity_m_s2(stretch: Stretch) -> tuple[float, float]:
     gravity, first = stretch.scene.gravity_m_s2, len(stretch.fit.change)
     size = float(np.linalg.norm(gravity))
     up = gravity / max(size, 1e-9)
-    return size, float(np.sqrt(max(float(up @ stretch.fit.covariance[first : first + 3, first : first + 3] @ up), 0.0)))
+    variance = float(up @ stretch.fit.covariance[first : first + 3, first : first + 3] @ up)
+    return size, float(np.sqrt(max(variance, 0.0)))
 
 
 def _no_fit(found: Window, gravity_m_s2: float, std_m_s2: float, before: float) -> str:

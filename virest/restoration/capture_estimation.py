@@ -42,6 +42,7 @@ from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_t
 from virest.restoration.conflict_plan import (
     MAX_FOCAL_SPREAD,
     MAX_OFFSET_STD_S,
+    OFFSET_SOURCE,
     estimated_offset,
     explains_points,
     settle,
@@ -60,6 +61,7 @@ since tracking can cause as much."""
 OTHER_OFFSET = "the frames indicate a time offset of"
 UNCHECKED = "agreement of frames and gyroscope could not be tested"
 OTHER_PATHS = "the frames show blur paths"
+CALIBRATE_EXPOSURE = "calibrate --with exposure-scale, or diagnose"
 NOT_ESTIMATED = "translation and depth not estimated: rotation only"
 
 
@@ -180,32 +182,42 @@ def _aligned(
 
 
 def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualInertialAlignment) -> RestorationPlan:
-    """Adopt the joint fit's offset and bias if the profile has no offset; else note a contradiction of it."""
+    """Adopt the joint fit's offset if the profile has none or another, and its gyroscope bias where that differs."""
     clock, bias = alignment.clock(), alignment.gyro_bias()
     if clock is None or bias is None:
         return plan
     offset_s, std_s = clock
     if std_s > MAX_OFFSET_STD_S:
         return plan
-    if given.time_offset_s is not None:
-        return _with_offset_conflict(plan, given.time_offset_s, offset_s, std_s)
     source = "tracked points against gyroscope and accelerometer"
-    profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
+    if given.time_offset_s is not None:
+        plan = _with_offset_conflict(plan, given.time_offset_s, offset_s, std_s)
+    else:
+        profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
+        plan = replace(plan.without(NoteCode.TIME_OFFSET).without(NoteCode.NOT_FOLLOWING), profile=profile)
+        plan = plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
     values, spread = bias[0], np.hypot(bias[1], BIAS_FLOOR_RAD_S)
-    if np.any(np.abs(values) > 3 * spread):
-        held = tuple(float(value) for value in values)
-        profile = profile.with_estimate("gyro_bias_rad_s", list(held), spread.tolist(), source, gyro_bias_rad_s=held)
-    plan = replace(plan.without(NoteCode.TIME_OFFSET).without(NoteCode.NOT_FOLLOWING), profile=profile)
-    return plan.noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, std_s))
+    if not np.any(np.abs(values - plan.profile.gyro_bias_rad_s) > 3 * spread):
+        return plan
+    held = tuple(float(value) for value in values)
+    profile = plan.profile.with_estimate("gyro_bias_rad_s", list(held), spread.tolist(), source, gyro_bias_rad_s=held)
+    return replace(plan, profile=profile)
 
 
 def _with_offset_conflict(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
-    """Note a difference between the frames' time offset and the profile's, if it is significant."""
+    """Replace the profile's time offset by the frames', with a note, where they differ significantly.
+
+    A wrong offset misplaces rows by the rotation rate's change over it, and an offset from tracked points holds at
+    mid-exposure whatever the cause, be it the clock, a gyroscope's low pass or another exposure time.
+    """
     if abs(offset_s - given_s) < max(OFFSET_DOUBT_S, 3 * std_s):
         return plan
-    text = f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ms, the profile says otherwise: calibrate"
-    contradicted = replace(plan.profile, time_offset_s=offset_s)
-    return replace(plan, contradicted=contradicted).noted(NoteCode.OTHER_OFFSET, text)
+    text = (
+        f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ± {std_s * 1e3:.1f} ms, used instead of the profile's "
+        f"{given_s * 1e3:+.1f} ms: calibrate"
+    )
+    profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
+    return replace(plan, profile=profile).noted(NoteCode.OTHER_OFFSET, text)
 
 
 def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[int]) -> dict[int, float]:
@@ -227,10 +239,10 @@ def _with_blur_length_check(
     """Note blur paths of another length than predicted, and set ``contradicted`` so that harmful steps are skipped.
 
     An offset from tracked points holds at mid-exposure, so it is corrected for the different exposure time.  A stated
-    offset is kept if the points do not contradict it, or if the different exposure time explains the contradiction.
+    offset is kept for the observed motion if the points do not contradict it, or if the different exposure time
+    explains the contradiction, which the note then says.
     """
-    profile = plan.contradicted or plan.profile
-    found_by_points = plan.contradicted is not None or given.time_offset_s is None
+    profile = plan.profile
     if not powers or profile.intrinsics is None:
         return plan
     trajectory = integrate_gyro(capture.imu, profile)
@@ -246,17 +258,19 @@ def _with_blur_length_check(
     found = path_scale(shown, capture.bits_per_px)
     if found is None or not found.contradicts:
         return plan
-    text = f"{OTHER_PATHS} {found} times as long as the profile says: calibrate --with exposure-scale, or diagnose"
-    shutter = profile.shutter
-    offset_s = profile.time_offset_s or 0.0
-    if found_by_points:
+    shutter, offset_s, explained = profile.shutter, profile.time_offset_s or 0.0, ""
+    if profile.time_offset_s != given.time_offset_s:
         logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
         to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(logged_s)
         offset_s += (1 - found.scale) * to_middle_s
         tolerance_s = max(OFFSET_DOUBT_S, 3 * found.scale * found.std * abs(to_middle_s))
         if given.time_offset_s is not None and abs(offset_s - given.time_offset_s) < tolerance_s:
+            explained = (
+                f", which explains the time offset of {1e3 * (profile.time_offset_s or 0.0):+.1f} ms that is used"
+            )
             offset_s = given.time_offset_s
             plan = plan.without(NoteCode.OTHER_OFFSET)
+    text = f"{OTHER_PATHS} {found} times as long as the profile says{explained}: {CALIBRATE_EXPOSURE}"
     shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
     contradicted = replace(profile, shutter=shutter, time_offset_s=offset_s)
     return replace(plan, contradicted=contradicted).noted(NoteCode.BLUR_LENGTH, text)

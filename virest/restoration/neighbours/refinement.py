@@ -24,7 +24,7 @@ FALSE_ALARM = 1e-3
 """Probability of correcting a correct prediction."""
 NEGLIGIBLE_PX = 0.05
 """Path error below which nothing is corrected: it spoils 0.2 % of the power at 0.5 cycles per pixel (|2πf δ|² / 12),
-less than any movie's noise."""
+less than any movie's noise.  Rows misplaced by δ rms spoil as much as a path that is √12 δ too long."""
 FARTHEST = 5.0
 """Reject a pair whose missing rate exceeds this many standard deviations: it shows something else, such as a passing
 bus."""
@@ -32,9 +32,9 @@ HALF_SPACING = 0.25
 """Error of linear interpolation over that at twice the spacing: it is proportional to the spacing squared."""
 
 
-LAG_STD_S, PART_STD = 0.003, 0.1
-"""Priors of both: recorders stamp frames and samples to a few milliseconds, and a stabiliser or low pass removes about
-a tenth of the rotation from the picture or the log."""
+LAG_STD_S, PART_STD, BIAS_STD_RAD_S = 0.003, 0.1, 0.02
+"""Priors: recorders stamp frames and samples to a few milliseconds; a stabiliser or low pass removes about a tenth of
+the rotation from the picture or the log; the bias of phones' gyroscopes is below 0.02 rad/s."""
 MOST_REMAINING = 0.5
 """Use the fitted lag and part if they reduce the interpolation error's variance below this fraction.  A stabiliser that
 cancels only slow rotation is no function of the rate, and a fit of two values always reduces the variance a little
@@ -46,24 +46,24 @@ NODE_S = 0.004
 
 @dataclass(frozen=True, slots=True)
 class FollowingTurn:
-    """The part of the missing rate that is a function of the predicted rate ω: lag · dω/dt + part · ω.
+    """The missing rate that is constant or a function of the predicted rate ω: bias + lag · dω/dt + part · ω.
 
     The lag is a clock offset; the part is a scale error, residual stabilisation or a low pass.
     """
 
+    bias_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lag_s: float = 0.0
     part: float = 0.0
 
     def at(self, trajectory: Trajectory, time_s: Array) -> Array:
         """(n, 3) rad/s at times (n,)."""
-        return np.asarray(
-            self.lag_s * trajectory.angular_acceleration_rad_s2(time_s) + self.part * trajectory.rate_rad_s(time_s)
-        )
+        late = self.lag_s * trajectory.angular_acceleration_rad_s2(time_s)
+        return np.asarray(self.bias_rad_s + late + self.part * trajectory.rate_rad_s(time_s))
 
     def residual_of(self, turn: PairTurn, trajectory: Trajectory) -> PairTurn:
         """The part of a pair's missing rate that it does not explain."""
         change, mean = _change_and_mean(turn, trajectory)
-        return replace(turn, rate_rad_s=turn.rate_rad_s - self.lag_s * change - self.part * mean)
+        return replace(turn, rate_rad_s=turn.rate_rad_s - self.bias_rad_s - self.lag_s * change - self.part * mean)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,13 +152,11 @@ class RefinedMotion:
 
         The speed error accumulates over the time between a row's mid-exposure and the reference time.
         """
-        motion = self.motion
-        if motion.exposure_s <= 0:
+        exposure_s = self.motion.exposure_s
+        if exposure_s <= 0:
             return 0.0
-        corners = np.array([[0.0, 0.0], [motion.profile.width - 1.0, motion.profile.height - 1.0]])
-        first, last = (motion.row_time_s(corners, 0.5) - motion.reference_s) / motion.exposure_s
-        square = (first**2 + first * last + last**2) / 3
-        return float(np.sqrt(square * np.trace(self.path_covariance_px2()) / 2))
+        per_exposure_px = np.sqrt(np.trace(self.path_covariance_px2()) / 2)
+        return float(per_exposure_px * _rms_from_reference_s(self.motion) / exposure_s)
 
 
 def missing_turn(
@@ -189,19 +187,28 @@ def missing_turn(
         len(turns),
         following,
     )
-    longest = max(_path_change_px(motion, found.rate_rad_s) for motion in motions)
+    longest = max(_harm_px(motion, found.rate_rad_s) for motion in motions)
     return found if longest > NEGLIGIBLE_PX else None
 
 
 def following_turn(turns: Sequence[PairTurn], trajectory: Trajectory) -> FollowingTurn:
-    """Fit the lag and the part to pairs' missing rates, with their priors (ridge regression)."""
-    design = np.concatenate([np.stack(_change_and_mean(turn, trajectory), -1) for turn in turns])
+    """Fit bias, lag and part to pairs' missing rates, with their priors (ridge regression)."""
+    design = np.concatenate([np.column_stack((np.eye(3), *_change_and_mean(turn, trajectory))) for turn in turns])
     rates = np.concatenate([turn.rate_rad_s for turn in turns])
     left = rates - design @ np.linalg.lstsq(design, rates, rcond=None)[0]
-    variance = max(float(left @ left) / max(len(left) - 2, 1), 1e-12)
-    usual = np.diag([1 / LAG_STD_S**2, 1 / PART_STD**2])
-    lag_s, part = np.linalg.solve(design.T @ design / variance + usual, design.T @ rates / variance)
-    return FollowingTurn(float(lag_s), float(part))
+    variance = max(float(left @ left) / max(len(left) - 5, 1), 1e-12)
+    usual = np.diag([*[1 / BIAS_STD_RAD_S**2] * 3, 1 / LAG_STD_S**2, 1 / PART_STD**2])
+    x, y, z, lag_s, part = np.linalg.solve(design.T @ design / variance + usual, design.T @ rates / variance).tolist()
+    return FollowingTurn((x, y, z), lag_s, part)
+
+
+def biased_turn(turns: Sequence[PairTurn]) -> FollowingTurn:
+    """The bias alone: the median of pairs' missing rates, shrunk towards 0 by its variance (π / 2n of one pair's)."""
+    rates = np.array([turn.rate_rad_s for turn in turns])
+    middle = np.median(rates, axis=0)
+    variance = np.median(((rates - middle) ** 2).sum(axis=1)) / chi2_median(3) * np.pi / 2 / len(rates)
+    x, y, z = (middle * BIAS_STD_RAD_S**2 / (BIAS_STD_RAD_S**2 + variance)).tolist()
+    return FollowingTurn((x, y, z))
 
 
 def _change_and_mean(turn: PairTurn, trajectory: Trajectory) -> tuple[Array, Array]:
@@ -220,11 +227,12 @@ def _variance(turns: Sequence[PairTurn]) -> float:
 def accepted_turn(
     runs: Sequence[Sequence[PairTurn | None]], trajectory: Trajectory
 ) -> tuple[FollowingTurn, float | None]:
-    """The fitted lag and part if they meet MOST_REMAINING, else zeros, and :func:`_bend` of the rest."""
-    none, bend = FollowingTurn(), _bend(runs)
+    """The fitted bias, lag and part if they meet MOST_REMAINING, else the bias alone; and :func:`_bend` of the rest."""
+    turns = [turn for run in runs for turn in run if turn is not None]
+    none, bend = biased_turn(turns), _bend(runs)
     if bend is None:
         return none, None
-    fitted = following_turn([turn for run in runs for turn in run if turn is not None], trajectory)
+    fitted = following_turn(turns, trajectory)
     left = _bend([[None if turn is None else fitted.residual_of(turn, trajectory) for turn in run] for run in runs])
     return (fitted, left) if left is not None and left < MOST_REMAINING * bend else (none, bend)
 
@@ -240,11 +248,23 @@ def _bend(runs: Sequence[Sequence[PairTurn | None]]) -> float | None:
     return float(np.mean([max(e @ e - np.trace(c), 0.0) / 3 for e, c in bends])) if bends else None
 
 
-def _path_change_px(motion: RowMotion, rate_rad_s: float) -> float:
-    """Change, px, of the blur path in the picture's centre by such a missing rate."""
+def _harm_px(motion: RowMotion, rate_rad_s: float) -> float:
+    """Change, px, of the blur path in the picture's centre by such a missing rate; or √12 times that of its rows' rms.
+
+    The latter is 0 where the readout is unknown, so that rows stay where they are.
+    """
     profile = motion.profile
     centre = np.array([[(profile.width - 1) / 2, (profile.height - 1) / 2]])
-    return float(np.abs(turn_jacobian_px(motion, centre)[0]).max() * rate_rad_s * motion.exposure_s)
+    speed_px_s = float(np.abs(turn_jacobian_px(motion, centre)[0]).max() * rate_rad_s)
+    apart_s = _rms_from_reference_s(motion) if profile.readout_known else 0.0
+    return speed_px_s * max(motion.exposure_s, float(np.sqrt(12)) * apart_s)
+
+
+def _rms_from_reference_s(motion: RowMotion) -> float:
+    """RMS over the rows of the time between their mid-exposure and the reference."""
+    corners = np.array([[0.0, 0.0], [motion.profile.width - 1.0, motion.profile.height - 1.0]])
+    first, last = motion.row_time_s(corners, 0.5) - motion.reference_s
+    return float(np.sqrt((first**2 + first * last + last**2) / 3))
 
 
 def _shrunk(turn: PairTurn, prior: Array) -> tuple[float, Array, Array]:
