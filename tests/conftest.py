@@ -22,15 +22,22 @@ SHARING = {"blur_length_check", "calibrate_command", "calibrate_stories", "calib
            "local_blur", "log_against_truth", "neighbours", "recorder_stall", "report_command", "restoration_gain",
            "run_folder", "translation", "undistort"}  # fmt: skip
 """Files whose tests share captures that take seconds to simulate: each file runs in one process."""
+LONGEST = ("calibrate_stories", "real_captures", "translation", "neighbours", "pages", "fields", "diagnose_stories",
+           "evaluate_slam", "diagnose_again", "diagnose_command", "cli", "urls", "crashes", "restoration_quality",
+           "curve_matters")  # fmt: skip
+"""Files of scenarios by their longest part that one process runs, 80 s to 10 s: begun last, it would run alone."""
 
 
 def pytest_configure() -> None:
     """Give each of xdist's processes, and all that it starts, a core of its own: they are the parallelism already.
 
     A program that shares its work out over the cores it finds would start and load processes of its own in every test;
-    those that test this say so.  While tests are collected hardly anything becomes garbage.
+    those that test this say so.  While tests are collected hardly anything becomes garbage.  Compiled code is kept even
+    where a machine says otherwise: each of the many programs that the tests start would compile the package anew.
     """
     gc.disable()
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
@@ -38,10 +45,12 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the fast tests first, then the scenarios, the whole stories before single tests of the program."""
+    """Run the fast tests first, then the scenarios, the longest before the others."""
+    rank = {f"test_{name}": k for k, name in enumerate(LONGEST)}
 
-    def order(item: pytest.Item) -> tuple[bool, bool]:
-        return item.get_closest_marker("scenario") is not None, item.path.parent.name != "scenarios"
+    def order(item: pytest.Item) -> tuple[bool, int]:
+        scenario = item.get_closest_marker("scenario") is not None
+        return scenario, rank.get(item.path.stem, len(rank)) if scenario else 0
 
     items.sort(key=order)
 
@@ -78,26 +87,30 @@ def realdata() -> Path:
 
 
 @pytest.fixture(scope="session")
-def virest() -> Iterator[RunVirest]:
+def fork_server() -> Iterator[ForkServer]:
+    """A process that has imported the program and forks it for each call."""
+    with ForkServer() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def virest(fork_server: ForkServer) -> RunVirest:
     """The program as its users run it: ``virest("process", folder)`` gives returncode, stdout, stderr.
 
     Forked from a process that has imported it already, where that can be; with variables of its own it is started anew.
     """
-    with ForkServer() as server:
 
-        def run(
-            *arguments: object, cwd: Path | None = None, stdin: str = "", timeout: float = 1200, **environment: str
-        ):
-            words = [*map(str, arguments)]
-            if hasattr(os, "fork") and not environment:
-                return server.run(words, cwd, stdin, timeout)
-            return subprocess.run(
-                [sys.executable, "-m", "virest", *words],
-                cwd=cwd, input=stdin, capture_output=True, text=True, timeout=timeout, check=False,
-                env={**os.environ, **environment},
-            )  # fmt: skip
+    def run(*arguments: object, cwd: Path | None = None, stdin: str = "", timeout: float = 1200, **environment: str):
+        words = [*map(str, arguments)]
+        if hasattr(os, "fork") and not environment:
+            return fork_server.run(words, cwd, stdin, timeout)
+        return subprocess.run(
+            [sys.executable, "-m", "virest", *words],
+            cwd=cwd, input=stdin, capture_output=True, text=True, timeout=timeout, check=False,
+            env={**os.environ, **environment},
+        )  # fmt: skip
 
-        yield run
+    return run
 
 
 @pytest.fixture

@@ -14,20 +14,32 @@ import json
 import os
 import pkgutil
 import runpy
+import select
+import shlex
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, NoReturn
+
+LAZY = ("pandas", "typer._adapters", "pydantic.type_adapter", "matplotlib.figure", "matplotlib.backends.backend_agg")
+"""Modules that the program loads only once a table is read, an option is checked, a figure is drawn."""
+MOST_BYTES = 1 << 20
+"""Longest call: arguments and variables."""
+LONGEST_S = 1200.0
+"""Most time of a call out of a shell."""
 
 
 class ForkServer:
     """Calls of the program, one after the other."""
 
     process: subprocess.Popen[str] | None = None
+    folder: tempfile.TemporaryDirectory[str] | None = None
 
     def __enter__(self) -> ForkServer:
         return self
@@ -35,56 +47,94 @@ class ForkServer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self.process is not None:
+        if self.process is not None and self.folder is not None:
             self.process.communicate()
+            self.folder.cleanup()
+
+    def address(self) -> str:
+        """Where the server listens; it is started by the first who asks."""
+        if self.folder is None:
+            self.folder = tempfile.TemporaryDirectory()
+            self.process = subprocess.Popen(
+                [sys.executable, __file__, "serve", os.path.join(self.folder.name, "calls")],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            )  # fmt: skip
+            assert self.process.stdout is not None
+            self.process.stdout.readline()
+        return os.path.join(self.folder.name, "calls")
+
+    def shell_function(self) -> dict[str, str]:
+        """The variable by which every bash below takes ``virest`` for a call of the server."""
+        client = shlex.join([sys.executable, "-SE", __file__, "call", self.address()])
+        return {"BASH_FUNC_virest%%": f'() {{ {client} "$@"; }}'}
 
     def run(
         self, arguments: list[str], cwd: Path | None, stdin: str, timeout: float
     ) -> subprocess.CompletedProcess[str]:
         """Run the program with arguments in a folder; its exit code and what it wrote. After ``timeout`` s it ends."""
-        if self.process is None:
-            self.process = subprocess.Popen(
-                [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-            )
-        with tempfile.TemporaryDirectory() as folder:
-            streams = [os.path.join(folder, name) for name in ("in", "out", "err")]
-            Path(streams[0]).write_text(stdin)
-            call = {"arguments": arguments, "cwd": os.fspath(cwd or os.getcwd()), "streams": streams, "s": timeout}
-            call["environment"] = dict(os.environ)
-            assert self.process.stdin is not None
-            assert self.process.stdout is not None
-            print(json.dumps(call), file=self.process.stdin, flush=True)
-            status = int(self.process.stdout.readline())
-            out, err = (Path(name).read_text() for name in streams[1:])
-        return subprocess.CompletedProcess(arguments, os.waitstatus_to_exitcode(status), out, err)
+        with contextlib.ExitStack() as files:
+            streams = [files.enter_context(tempfile.TemporaryFile("w+")) for _ in range(3)]
+            streams[0].write(stdin)
+            streams[0].seek(0)
+            code = called(self.address(), arguments, os.fspath(cwd or os.getcwd()), streams, timeout)
+            for stream in streams[1:]:
+                stream.seek(0)
+            return subprocess.CompletedProcess(arguments, code, *(stream.read() for stream in streams[1:]))
 
 
-def serve(calls: IO[str], answers: IO[str]) -> None:
-    """Fork a program for each line, and answer its status."""
-    importlib.import_module("pandas")  # loaded only once a table is read
+def called(address: str, arguments: list[str], cwd: str, streams: Sequence[IO[str]], timeout: float) -> int:
+    """Have the server run the program with these standard streams; its exit code."""
+    call = {"arguments": arguments, "cwd": cwd, "s": timeout, "environment": dict(os.environ)}
+    with socket.socket(socket.AF_UNIX) as server:
+        server.connect(address)
+        socket.send_fds(server, [f"{json.dumps(call)}\n".encode()], [stream.fileno() for stream in streams])
+        return os.waitstatus_to_exitcode(int(server.recv(MOST_BYTES)))
+
+
+def serve(address: str) -> None:
+    """Fork a program for each call, and answer its status."""
+    for name in LAZY:
+        importlib.import_module(name)
     package = importlib.import_module("virest")
     for module in pkgutil.walk_packages(package.__path__, "virest."):
         if not module.name.endswith("__main__"):
             with contextlib.suppress(ImportError):
                 importlib.import_module(module.name)
+    importlib.import_module("virest.app.cli").program()
     gc.freeze()
-    for line in calls:
-        call = json.loads(line)
+    with socket.socket(socket.AF_UNIX) as calls:
+        calls.bind(address)
+        calls.listen()
+        print("ready", flush=True)
+        while calls in select.select([calls, sys.stdin], [], [])[0]:
+            answer(calls.accept()[0])
+
+
+def answer(connection: socket.socket) -> None:
+    """Fork a program for one call, wait for it, and answer its status."""
+    with connection:
+        text, streams, _, _ = socket.recv_fds(connection, MOST_BYTES, 3)
+        while not text.endswith(b"\n"):
+            text += connection.recv(MOST_BYTES)
+        call = json.loads(text)
         child = os.fork()
         if not child:
             signal.alarm(int(call["s"]))
             os.environ.clear()
             os.environ.update(call["environment"])
-            become(call["arguments"], call["cwd"], call["streams"])
-        print(os.waitpid(child, 0)[1], file=answers, flush=True)
+            become(call["arguments"], call["cwd"], streams)
+        for stream in streams:
+            os.close(stream)
+        connection.sendall(str(os.waitpid(child, 0)[1]).encode())
 
 
-def become(arguments: list[str], cwd: str, streams: list[str]) -> None:
+def become(arguments: list[str], cwd: str, streams: Sequence[int]) -> NoReturn:
     """Be the program from here on."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(cwd)
-    for number, (name, flags) in enumerate(zip(streams, (os.O_RDONLY, *[os.O_WRONLY | os.O_CREAT] * 2), strict=True)):
-        os.dup2(os.open(name, flags, 0o600), number)
+    for number, stream in enumerate(streams):
+        os.dup2(stream, number)
+        os.close(stream)
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         stream = open(number, mode, closefd=False)  # noqa: SIM115
         setattr(sys, name, stream)
@@ -113,4 +163,8 @@ def leave(code: int) -> NoReturn:
 
 
 if __name__ == "__main__":
-    serve(sys.stdin, sys.stdout)
+    task, address, *arguments = sys.argv[1:]
+    if task == "serve":
+        serve(address)
+    else:
+        sys.exit(called(address, arguments, os.getcwd(), (sys.stdin, sys.stdout, sys.stderr), LONGEST_S))

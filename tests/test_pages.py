@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from documentation import DOCS, PAGES, ROOT, name_of, read
+from documentation import DOCS, PAGES, README, ROOT, name_of, read
+from fork_server import ForkServer
 
 from virest import __version__
 from virest.app import pages
@@ -76,8 +77,16 @@ def test_a_block_was_printed_by_this_version(block: pages.Block) -> None:
 @pytest.mark.scenario
 @pytest.mark.skipif(shutil.which("jq") is None, reason="some blocks pipe into jq")
 @pytest.mark.parametrize("block", SESSIONS, ids=label)
-def test_a_session_prints_what_the_page_says(block: pages.Block) -> None:
-    """The commands of a block are run from an empty folder; clocks and last digits may differ."""
+def test_a_session_prints_what_the_page_says(
+    block: pages.Block, fork_server: ForkServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands of a block are run from an empty folder; clocks and last digits may differ.
+
+    Those of the README are started as a reader starts them, the others are forked.
+    """
+    if block.page != README:
+        for name, value in fork_server.shell_function().items():
+            monkeypatch.setenv(name, value)
     assert not pages.differences(block.session, pages.rerun(block)[0])
 
 

@@ -523,7 +523,7 @@ def test_inspect_prints_what_it_can(virest: Virest, tiny: Path, *, as_json: bool
 
 # ── being stopped ────────────────────────────────────────────────────────────────────────────────────────────────
 
-ITERATIONS = 80
+ITERATIONS = 40
 """A tenth of a second for each frame of ``swing``: a run is still at work when it is stopped."""
 
 

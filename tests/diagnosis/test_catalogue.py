@@ -7,7 +7,7 @@ import pickle
 from virest.diagnosis.findings import BLUR, EDGES, GEOMETRY, PHOTOMETRY
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.local_blur_fit import Defocus, ExposureTime
-from virest.diagnosis.photometry_effects import BlackLevel, Flicker, ResponseGamma, Vignetting
+from virest.diagnosis.photometry_effects import BLACK_LEVEL, RESPONSE_GAMMA, VIGNETTING, Flicker
 from virest.effects.table import EFFECTS as CATALOGUE
 from virest.simulation.effects import EFFECTS
 
@@ -24,7 +24,7 @@ def test_the_simulator_hides_what_the_catalogue_names_and_nothing_else() -> None
 def test_every_named_cause_has_somebody_who_looks_for_it() -> None:
     """Points, brightness, blur and edges share the catalogue between them; exposures that vary move points too."""
     points = {effect.name for effect in GEOMETRIC_EFFECTS} - {"exposure_time"} | SPECIAL
-    light = {effect().name for effect in (ResponseGamma, BlackLevel, Vignetting, Flicker)} | {"gain_drift"}
+    light = {effect.name for effect in (RESPONSE_GAMMA, BLACK_LEVEL, VIGNETTING, Flicker())} | {"gain_drift"}
     blur = {effect().name for effect in (ExposureTime, Defocus)}
     for quantity, seekers in ((GEOMETRY, points), (PHOTOMETRY, light), (BLUR, blur), (EDGES, {"sharpening"})):
         assert {name for name, cause in CATALOGUE.items() if cause.seen_in == quantity} == seekers

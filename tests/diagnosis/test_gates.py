@@ -29,7 +29,7 @@ from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import Trial, _best_single
 from virest.diagnosis.geometric_significance import significant
-from virest.diagnosis.photometry_effects import Flicker, GainDrift, Vignetting
+from virest.diagnosis.photometry_effects import VIGNETTING, Flicker, GainDrift
 from virest.diagnosis.photometry_fit import fit_photometry, judge, time_blocks
 from virest.diagnosis.selection import FALSE_ALARM, MAX_P, Levels
 from virest.effects.table import EFFECTS
@@ -107,7 +107,7 @@ def test_brightness_is_judged_on_the_other_blocks(rng: np.random.Generator, monk
 
     monkeypatch.setattr(photometry_fit, "fit_photometry", fitted)
     monkeypatch.setattr(photometry_fit, "normalised_rms", lambda o, _: held.append(o.x_px) or (1.0, 0.5))
-    judge(observed, NOMINAL, [Vignetting()])
+    judge(observed, NOMINAL, [VIGNETTING])
     assert len(seen) == len(held) == 4
     for used, judged in zip(seen, held, strict=True):
         assert not np.intersect1d(used, judged).size
@@ -118,7 +118,7 @@ def test_the_noise_of_brightness_is_that_measured_beforehand(rng: np.random.Gene
     """What a fit leaves is no measure of the noise, whether it is less or more."""
     observed = made_observations(hidden(vignetting_corner_loss=0.3), rng)
     noisier = replace(observed, noise=1.5 * observed.noise)
-    held = judge(noisier, NOMINAL, [Vignetting()])
+    held = judge(noisier, NOMINAL, [VIGNETTING])
     assert held.after < 0.8 * held.noise
     assert held.noise == pytest.approx(1.5 * NOISE, rel=0.01)
 
@@ -239,7 +239,7 @@ def test_brightness_gains_too(
     monkeypatch.setattr(picture_ladder, "fit_photometry", lambda *_: better)
     monkeypatch.setattr(picture_ladder, "judge", lambda *_, **__: held)
     monkeypatch.setattr(picture_ladder, "significance", lambda *_: (9.0, p_value))
-    rung, effect, _ = picture_ladder._rung(observed, NOMINAL, plain, [Vignetting()], [], one_by_one)  # type: ignore[arg-type]
+    rung, effect, _ = picture_ladder._rung(observed, NOMINAL, plain, [VIGNETTING], [], one_by_one)  # type: ignore[arg-type]
     shown = ({"vignetting": held.after}, held.before) if p_value < 1e-6 else ({}, plain.rms)
     assert rung == Rung("vignetting" if named else None, *shown, PHOTOMETRY)
     assert (effect is not None) is named
@@ -261,7 +261,7 @@ def test_a_gain_of_each_frame_takes_half_of_the_excess_on_other_sides(
     gain = GainDrift((0, 1), 2)
     assert picture_ladder._judged(observed, NOMINAL, [Flicker()], gain, one_by_one) == (held, named)
     assert beside == [[Flicker()]]
-    assert picture_ladder._judged(observed, NOMINAL, [], Vignetting(), one_by_one) == (held, True)
+    assert picture_ladder._judged(observed, NOMINAL, [], VIGNETTING, one_by_one) == (held, True)
     assert len(beside) == 3
 
 
@@ -290,7 +290,7 @@ def test_patches_of_one_moment_share_its_errors(rng: np.random.Generator) -> Non
     mixed = rng.permutation(FRAMES)[observed.frame]
     as_often = np.array([lean[np.argmax(observed.frame == k)] for k in range(FRAMES)])[mixed]
     scattered = replace(observed, grey=observed.grey + 2.0 * NOISE * as_often * (observed.radius**2 - 0.2))
-    stds = [fit_photometry(one, NOMINAL, [Vignetting()]).std[0] for one in (wandering, scattered)]
+    stds = [fit_photometry(one, NOMINAL, [VIGNETTING]).std[0] for one in (wandering, scattered)]
     assert stds[0] > 1.25 * stds[1]
 
 

@@ -17,7 +17,7 @@ from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterC
 from virest.diagnosis.geometric_findings import with_depth_of
 from virest.diagnosis.local_blur_fit import BlurFit
 from virest.diagnosis.photometry import PhotometricObservations
-from virest.diagnosis.photometry_effects import BlackLevel, Flicker, GainDrift, ResponseGamma, Vignetting
+from virest.diagnosis.photometry_effects import BLACK_LEVEL, RESPONSE_GAMMA, VIGNETTING, Flicker, GainDrift
 from virest.diagnosis.photometry_fit import fit_photometry, significance
 from virest.diagnosis.picture_ladder import (
     PictureVerdict,
@@ -30,11 +30,11 @@ from virest.diagnosis.picture_ladder import (
 
 GAIN = np.exp(0.1 * np.sin(0.9 * np.arange(FRAMES)))
 LIGHT = {
-    "vignetting": (Vignetting(), hidden(vignetting_corner_loss=0.4)),
+    "vignetting": (VIGNETTING, hidden(vignetting_corner_loss=0.4)),
     "flicker": (Flicker(), hidden(flicker_amplitude=0.3, flicker_frequency_hz=113.0, flicker_phase_rad=6.2)),
     "gain_drift": (GainDrift(tuple(range(FRAMES)), FRAMES), hidden(gain=tuple((GAIN / np.median(GAIN)).tolist()))),
-    "response_curve": (ResponseGamma(), hidden(1.25)),
-    "black_level": (BlackLevel(), hidden(1.0, 0.05)),
+    "response_curve": (RESPONSE_GAMMA, hidden(1.25)),
+    "black_level": (BLACK_LEVEL, hidden(1.0, 0.05)),
 }
 
 

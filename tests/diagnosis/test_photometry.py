@@ -28,12 +28,12 @@ from virest.diagnosis.field.brightness import (
 from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.photometry import PhotometricObservations, log_light_factor, remembered, residuals
 from virest.diagnosis.photometry_effects import (
-    BlackLevel,
+    BLACK_LEVEL,
+    RESPONSE_GAMMA,
+    VIGNETTING,
     Flicker,
     GainDrift,
     PhotometricEffect,
-    ResponseGamma,
-    Vignetting,
     photometric_effects,
 )
 from virest.diagnosis.photometry_fit import RESOLUTION, fit_photometry, judge, pulls, significance, time_blocks
@@ -62,13 +62,13 @@ def made_observations(
     products: float = 0.0,
     pace: float = 0.4,
     exposures_s: tuple[float, ...] = (0.007,),
+    patches: int = 150,
 ) -> PhotometricObservations:
     """Patches that wander through the picture, their grey written down from the contract's model.
 
     products: spread of the logged exposure × ISO, in log light.  pace: of its walk, radians a frame.  exposures_s: of
     the frames, in turn.
     """
-    patches = 150
     frame = np.tile(np.arange(FRAMES), patches)
     patch = np.repeat(np.arange(patches), FRAMES)
     sway = 90 * np.stack([np.sin(0.31 * np.arange(FRAMES)), np.cos(0.17 * np.arange(FRAMES))], axis=-1)
@@ -162,7 +162,7 @@ def named(observed: PhotometricObservations) -> dict[str, PictureVerdict]:
 
 def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(rng: np.random.Generator) -> None:
     """It stands on one side, comes over it for a while, or passes through; a cloud before the sun dims all alike."""
-    observed = made_observations(hidden(), rng)
+    observed = made_observations(hidden(), rng, patches=80)
     x, t = observed.x_px / 639, observed.frame / FRAMES
     side, while_there = 1 / (1 + np.exp(-(x - 0.5) / 0.06)), np.exp(-(((t - 0.5) / 0.2) ** 2))
     one_side = 1 / (1 + np.exp(-(x - 0.6) / 0.06))
@@ -176,7 +176,7 @@ def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(rng: np.ra
 
 def test_a_vignette_keeps_its_name_beside_a_shadow(rng: np.random.Generator) -> None:
     """And nearly its size; the lamps, whose frequency would be that of the frames, are not blamed."""
-    observed = made_observations(hidden(vignetting_corner_loss=0.2), rng)
+    observed = made_observations(hidden(vignetting_corner_loss=0.2), rng, patches=80)
     shade = 1 / (1 + np.exp(-(observed.x_px / 639 - 0.6) / 0.06))
     found = named(dimmed(observed, 1 - 0.2 * shade))
     assert list(found) == ["vignetting"]
@@ -185,7 +185,7 @@ def test_a_vignette_keeps_its_name_beside_a_shadow(rng: np.random.Generator) -> 
 
 def test_a_slope_of_the_light_is_no_gain_that_follows_the_camera(rng: np.random.Generator) -> None:
     """Where all patches move alike the two are the same for patches; the few numbers are told, and the rival is."""
-    observed = made_observations(hidden(), rng)
+    observed = made_observations(hidden(), rng, patches=80)
     found = named(dimmed(observed, 1 - 0.15 * observed.x_px / 639))
     verdict = found["gain_drift"]
     assert verdict.observations is not None
@@ -205,18 +205,18 @@ def test_a_slope_of_the_light_is_no_gain_that_follows_the_camera(rng: np.random.
 def test_each_effect_comes_back_within_its_deviation(rng: np.random.Generator) -> None:
     """Vignetting and flicker are found at a constant exposure, gamma and black level where it changes."""
     observed = made_observations(hidden(vignetting_corner_loss=0.35), rng)
-    fit = fit_photometry(observed, NOMINAL, [Vignetting()])
+    fit = fit_photometry(observed, NOMINAL, [VIGNETTING])
     assert fit.values[0] == pytest.approx(0.35, abs=3 * fit.std[0] + 1e-9)
     assert fit.std[0] < 0.01
     lamp = hidden(flicker_amplitude=0.22, flicker_frequency_hz=100.0, flicker_phase_rad=2.0)
     fit = fit_photometry(made_observations(lamp, rng), NOMINAL, [Flicker()])
     np.testing.assert_array_less(np.abs(fit.values - (0.22, 100.0, 2.0)), 4 * fit.std)
     assert fit.std[0] < 0.01
-    fit = fit_photometry(made_observations(hidden(1.2, 0.05), rng, 0.25), NOMINAL, [ResponseGamma(), BlackLevel()])
+    fit = fit_photometry(made_observations(hidden(1.2, 0.05), rng, 0.25), NOMINAL, [RESPONSE_GAMMA, BLACK_LEVEL])
     np.testing.assert_array_less(np.abs(fit.values - (1.2, 0.05)), 4 * fit.std)
     np.testing.assert_array_less(fit.std, (0.03, 0.01))
     # the deviation of each knows of the other: alone they would look better known
-    alone = fit_photometry(made_observations(hidden(1.2, 0.05), rng, 0.25), hidden(1.2), [BlackLevel()])
+    alone = fit_photometry(made_observations(hidden(1.2, 0.05), rng, 0.25), hidden(1.2), [BLACK_LEVEL])
     floor = RESOLUTION["black_level"] ** 2
     assert fit.covariance[1, 1] - floor > 1.5 * (alone.covariance[0, 0] - floor)
 
@@ -239,7 +239,7 @@ def test_gains_are_judged_on_other_places(rng: np.random.Generator) -> None:
 def test_constant_exposure_leaves_the_curve_open(rng: np.random.Generator) -> None:
     """Where no light factor changes, brightness says nothing about gamma or black level, and the fit says so."""
     observed = made_observations(hidden(1.2, 0.05), rng)
-    for effect, wide in ((ResponseGamma(), 0.3), (BlackLevel(), 0.03)):
+    for effect, wide in ((RESPONSE_GAMMA, 0.3), (BLACK_LEVEL, 0.03)):
         fit = fit_photometry(observed, NOMINAL, [effect])
         assert fit.std[0] > wide
         assert significance(fit, effect.name, observed, NOMINAL)[1] > 1e-3
@@ -378,11 +378,11 @@ def observe(tmp_path: Path) -> Observe:
 def test_vignetting_is_found_although_the_geometry_is_wrong(observe: Observe) -> None:
     """A clock 10 ms off moves patches by several pixels; the loss at the corners still comes back."""
     observed, nominal, true = observe("vignetting=0.4", "time_offset=0.01", rate_rad_s=1.4)
-    fit = fit_photometry(observed, nominal, [Vignetting()])
+    fit = fit_photometry(observed, nominal, [VIGNETTING])
     assert fit.values[0] == pytest.approx(true.extensions.vignetting_corner_loss, abs=0.04)
     assert fit.values[0] == pytest.approx(true.extensions.vignetting_corner_loss, abs=3 * fit.std[0])
     assert significance(fit, "vignetting", observed, nominal)[1] < 1e-6
-    assert judge(observed, nominal, [Vignetting()]).gain > 0.8
+    assert judge(observed, nominal, [VIGNETTING]).gain > 0.8
 
 
 def test_a_lamp_is_found_in_a_movie(observe: Observe) -> None:
@@ -397,7 +397,7 @@ def test_a_lamp_is_found_in_a_movie(observe: Observe) -> None:
 def test_a_curve_is_found_where_the_logged_light_changes(observe: Observe) -> None:
     """With exposure × ISO that changes as logged, a gamma is found and no gain is."""
     observed, nominal, _ = observe("gain_drift=0.2", "response_curve=1.25", log_gains=True)
-    fit = fit_photometry(observed, nominal, [ResponseGamma()])
+    fit = fit_photometry(observed, nominal, [RESPONSE_GAMMA])
     assert fit.values[0] == pytest.approx(1.25, abs=0.06)
     assert fit.values[0] == pytest.approx(1.25, abs=3 * fit.std[0] + 0.01)
     assert log_light_factor(observed, nominal) == pytest.approx(observed.log_product)
@@ -460,7 +460,7 @@ def settled(
     observed: PhotometricObservations, evidence: MixingEvidence | None, given: CameraProfile = NOMINAL
 ) -> tuple[PictureVerdict, PictureVerdict, CameraProfile]:
     """(ladder's verdict, the same settled, profile) on patches and on what blur mixed."""
-    light = lit(observed, given, Vignetting())
+    light = lit(observed, given, VIGNETTING)
     curve = PictureVerdict(light.profile)
     if evidence is not None:
         name_curve(curve, evidence)
@@ -536,7 +536,7 @@ def test_a_lamp_pulses_as_the_exposure_found_says(rng: np.random.Generator) -> N
 def test_a_small_gamma_that_was_not_named_is_not_excluded(rng: np.random.Generator) -> None:
     """Where exposures change, brightness itself says how far the curve may be off, and what that does to the rest."""
     observed = made_observations(hidden(1.05, vignetting_corner_loss=0.5), rng, 0.25)
-    light = lit(observed, NOMINAL, Vignetting())
+    light = lit(observed, NOMINAL, VIGNETTING)
     final, profile = settle_light(light, PictureVerdict(light.profile), NOMINAL, [])
     (taken, narrow), (loss, std) = loss_of(light), loss_of(final)
     assert loss == taken

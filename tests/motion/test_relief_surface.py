@@ -12,7 +12,7 @@ from motion.swaying_camera import CENTRE_PX, Sway, SwayingCamera
 
 from virest.camera.intrinsics import Intrinsics
 from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
-from virest.inference.depth import Sightings, TriangulatedPoints
+from virest.inference.depth import SightedPoints, TriangulatedPoints
 from virest.inference.relief import measure_roughness, picture_grid
 from virest.inference.visual_inertial import align
 from virest.motion.optics import MovingLens
@@ -90,7 +90,7 @@ def test_the_plane_stays_where_a_surface_tells_held_out_points_no_better(setup: 
             )
 
 
-def mosaic(count: int = 300, pairs: int = 8, noise: float = 0.01) -> Sightings:
+def mosaic(count: int = 300, pairs: int = 8, noise: float = 0.01) -> SightedPoints:
     """Points on patches of 0.1 rad at two inverse depths, 0.3 apart, each seen once in every pair."""
     rng = np.random.default_rng(4)
     rays = LENS.rays(rng.uniform((0, 0), (639, 479), (count * pairs, 2)), np.zeros(count * pairs))
@@ -102,7 +102,7 @@ def mosaic(count: int = 300, pairs: int = 8, noise: float = 0.01) -> Sightings:
     points = TriangulatedPoints(
         np.zeros(len(rays), np.intp), rays / inverse[:, None], 0.03 * pair, inverse, np.full(len(rays), noise)
     )
-    return Sightings(points, pair, np.zeros((len(rays), 3)), rays, found, np.zeros(len(rays)))
+    return SightedPoints(points, pair, np.zeros((len(rays), 3)), rays, found, np.zeros(len(rays)))
 
 
 def test_the_variogram_tells_sill_and_length() -> None:

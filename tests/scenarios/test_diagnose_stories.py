@@ -22,7 +22,7 @@ LARGEST_SIGMA = 4.5
 
 def _capture(work: Path, name: str, effects: list[str], seed: int, **options: Any) -> Path:
     upright = seed % 2
-    size = {"width": 360, "height": 480} if upright else {"width": 480, "height": 360}
+    size = {"width": 288, "height": 384} if upright else {"width": 384, "height": 288}
     simulate_command(
         work / name, frames=33, seed=seed, effects=effects, rate_rad_s=1.1, overwrite=True, truth_frames=False,
         **{"exposure_ms": 8, **size, **options},

@@ -262,6 +262,6 @@ def _shown(value: float | None, form: str) -> str:
     return "unknown" if value is None else format(value, form)
 
 
-def _wrapped(counts: dict[str, int], per_line: int = 4) -> list[str]:
+def _wrapped(counts: dict[str, int]) -> list[str]:
     parts = [f"{key} {value}" for key, value in counts.items() if value or not key.endswith("pts")]
-    return [", ".join(parts[i : i + per_line]) for i in range(0, len(parts), per_line)]
+    return [", ".join(parts[i : i + 4]) for i in range(0, len(parts), 4)]

@@ -23,7 +23,7 @@ from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import vector_from_rotation
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
 from virest.restoration.capture_estimation import plan_restoration
-from virest.restoration.settings import PRESETS, RestorationSettings
+from virest.restoration.settings import PRESETS
 from virest.simulation.effects import EffectContext, hidden_isp, hide_effects
 from virest.simulation.recording import RecordingOptions, write_recording
 from virest.simulation.recreation import ScenePicture, known_frames, recreate_session
@@ -93,12 +93,10 @@ def count_frames(like: Path, frames: slice | None = None) -> int:
     return len(known_frames(capture.frames[frames or slice(None)]))
 
 
-def scene_plan(
-    capture: Capture, profile: CameraProfile, settings: RestorationSettings = PRESETS["balanced"]
-) -> RestorationPlan:
+def scene_plan(capture: Capture, profile: CameraProfile) -> RestorationPlan:
     """The capture's restoration plan, unknown values estimated. Raises SettingsError without a focal length."""
     read = partial(read_decodable_gray, capture.movie, probe_movie(capture.movie))
-    plan = plan_restoration(capture, profile, settings, read)
+    plan = plan_restoration(capture, profile, PRESETS["balanced"], read)
     if plan.profile.intrinsics is None:
         raise SettingsError(
             f"{capture.name}: {plan.copy_reason or 'focal length unknown'}", hint="--config takes a camera profile"

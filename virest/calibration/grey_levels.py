@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.stats import chi2
 
 from virest.arrays import Array, Mask
+from virest.inference.chance import chi2_below
 from virest.inference.robust import MEDIAN_TO_STD
 
 DARKEST_JUDGED, BRIGHTEST_JUDGED = 4.0, 251.0
@@ -86,7 +86,7 @@ def pixel_noise(means: Array, variances: Array, pixels: int) -> GreyNoise:
     """
     edges, middles = grey_bins()
     # FLAT_SHARE of the squares with pure noise have a sample variance below this multiple of the true variance
-    quantile = float(chi2.ppf(FLAT_SHARE, pixels - 1)) / (pixels - 1)
+    quantile = chi2_below(FLAT_SHARE, pixels - 1) / (pixels - 1)
     table = np.full((len(means), len(middles)), np.nan)
     for c, (greys, variance) in enumerate(zip(means, variances, strict=True)):
         grey_bin = np.digitize(greys, edges) - 1

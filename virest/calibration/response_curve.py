@@ -55,6 +55,10 @@ OPEN_LEVELS = 2.0
 """Standard deviation of the curve above which it is reported as loosely determined."""
 UNDETERMINED_LEVELS = 25.0
 """Standard deviation above which the fit is refused: a tenth of the grey range."""
+STRUCTURE_BINS = 16
+"""Bins of equal counts by grey whose mean residuals show the systematic part: 16 levels each."""
+COMPARED_GREYS = 400
+"""Greys at which curves are compared: two per grey level of a usual range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +112,7 @@ class CurveFit:
     cloud: DataCloud
 
 
-def fit_response(
-    pictures: Sequence[BracketPicture], kind: str = "auto", rng: np.random.Generator | None = None
-) -> CurveFit:
+def fit_response(pictures: Sequence[BracketPicture], kind: str = "auto") -> CurveFit:
     """Fit a curve of one kind, or of the simplest kind that held-out sites do not reject (``auto``).
 
     Raises CalibrationError for fewer than two pictures, a single exposure, no overlap, pictures clipped throughout,
@@ -119,9 +121,8 @@ def fit_response(
     """
     if kind not in ("auto", *KINDS):
         raise SettingsError(f"kind '{kind}' is no curve", hint=f"use auto, {', '.join(KINDS)}")
-    rng = np.random.default_rng(0) if rng is None else rng
     _require_bracket(pictures)
-    samples = sample_bracket(pictures, rng)
+    samples = sample_bracket(pictures, np.random.default_rng(0))
     return _fit_samples(pictures, samples, kind)
 
 
@@ -314,13 +315,13 @@ def _with_reliability(samples: BracketSamples, first: FirstCurve) -> BracketSamp
 # ── assessment and result ────────────────────────────────────────────────────────────────────────────────────────
 
 
-def residual_structure(grey: Array, residual: Array, bins: int = 16) -> float:
+def residual_structure(grey: Array, residual: Array) -> float:
     """RMS of the systematic residual in grey levels: of the mean residuals by grey, contribution of noise removed."""
-    grey_bin = np.digitize(grey, np.quantile(grey, np.linspace(0, 1, bins + 1)[1:-1]))
-    number = np.bincount(grey_bin, minlength=bins)
+    grey_bin = np.digitize(grey, np.quantile(grey, np.linspace(0, 1, STRUCTURE_BINS + 1)[1:-1]))
+    number = np.bincount(grey_bin, minlength=STRUCTURE_BINS)
     good = number > 20
-    mean = np.bincount(grey_bin, residual, minlength=bins)[good] / number[good]
-    square = np.bincount(grey_bin, residual**2, minlength=bins)[good] / number[good]
+    mean = np.bincount(grey_bin, residual, minlength=STRUCTURE_BINS)[good] / number[good]
+    square = np.bincount(grey_bin, residual**2, minlength=STRUCTURE_BINS)[good] / number[good]
     excess = mean**2 - (square - mean**2) / number[good]
     return float(np.sqrt(max(float(excess.mean()), 0.0))) if good.any() else 0.0
 
@@ -416,16 +417,14 @@ def scale_exposure(curve: ResponseCurve, unit: float) -> ResponseCurve:
     return curve
 
 
-def curve_distance_levels(
-    curve: ResponseCurve, truth: ResponseCurve, exposure: tuple[float, float], points: int = 400
-) -> float:
+def curve_distance_levels(curve: ResponseCurve, truth: ResponseCurve, exposure: tuple[float, float]) -> float:
     """RMS difference of two curves in grey levels over a range of ``curve``'s exposures, at the best relative scale.
 
     The exposure axis has no absolute scale, so the factor between the two axes with the least difference is used.
     Points are spaced evenly in the grey of ``curve``.
     """
     ends = curve.encode(np.array(exposure))
-    light = np.unique(curve.linearise(np.linspace(float(ends[0]), float(ends[1]), points)))
+    light = np.unique(curve.linearise(np.linspace(float(ends[0]), float(ends[1]), COMPARED_GREYS)))
     grey = 255.0 * curve.encode(light)
 
     def miss(log_scale: float) -> float:

@@ -18,6 +18,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -79,12 +81,13 @@ class Field:
         if self.covariates not in allowed:
             known = " or ".join("(" + ", ".join(names) + ")" for names in allowed)
             raise SettingsError(f"field {self.kind}: covariates must be {known}, not {', '.join(self.covariates)}")
-        if len(self.knots) != len(self.covariates) or any(len(k) < 2 or np.any(np.diff(k) <= 0) for k in self.knots):
+        rising = all(len(k) > 1 and not any(b <= a for a, b in pairwise(k)) for k in self.knots)
+        if len(self.knots) != len(self.covariates) or not rising:
             raise SettingsError(f"field {self.kind}: needs two or more rising knots for each covariate")
         for name, rows in (("values", self.values), ("std", self.std or self.values)):
             if self.kind == "blur" and any(value < 0 for row in rows for value in row):
                 raise SettingsError(f"field blur: {name} must be 0 or more")
-            if len(rows) != np.prod([len(k) for k in self.knots]) or any(len(row) != parts for row in rows):
+            if len(rows) != prod(map(len, self.knots)) or any(len(row) != parts for row in rows):
                 raise SettingsError(f"field {self.kind}: {name} must have {parts} numbers for each knot")
 
     @property

@@ -1,14 +1,9 @@
 """Sharpening by the phone, measured from the overshoot at isolated edges with little blur.
 
-Neither a blur of light nor a response curve takes a step above its bright side or below its dark one; an unsharp mask
-``y + amount (y − G_radius ∗ y)`` does both.  Across a step blurred by lens and path with a Gaussian of width s, the
-profile as a fraction of the step height is
-
-    z(u) = Φ(u/s) + amount (Φ(u/s) − Φ(u/√(s² + radius²))),
-
-the linear form of Polesel, Ramponi & Mathews 2000 (doi:10.1109/83.826787).  A response curve bends a profile but keeps
-its range, so the mean of z(u) and 1 − z(−u) is fitted.  Where the step is wider than the mask, only amount · radius² is
-observable; the priors AMOUNT and RADIUS_PX then decide, and the standard deviations grow accordingly.
+The profile z(u) across a step is that of :mod:`virest.inference.unsharp_mask`.  A response curve bends a profile but
+keeps its range, so the mean of z(u) and 1 − z(−u) is fitted.  Where the step is wider than the mask, only
+amount · radius² is observable; the priors AMOUNT and RADIUS_PX then decide, and the standard deviations grow
+accordingly.
 
 The significance test uses all isolated edges, whatever their width: if a textured surface happens to be brightest next
 to an edge, that edge overshoots and is therefore steeper, so the sharpest edges overshoot in any such scene.  The
@@ -23,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.special import ndtr
 
 from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
@@ -39,7 +33,7 @@ from virest.image_formation.row_clock import RowClock
 from virest.inference.chance import student_tail
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.time_blocks import halves
-from virest.inference.unsharp_mask import SHARPEST
+from virest.inference.unsharp_mask import AMOUNT, RADIUS_PX, SHARPEST, START, edge_profile, fit_edge
 from virest.motion.trajectory import Trajectory, turned
 
 MIN_USED = 60
@@ -47,10 +41,10 @@ MIN_USED = 60
 LOCATION_PX, LOCATION_GROUPS = 20.0, 16
 """Cell size of a scene location: edges whose world directions share a cell, at the lens's focal length, show the same
 location; and the number of location groups of the jackknife."""
-RADIUS_PX, RADIUS_SPREAD = 1.2, 0.45
-"""Prior of the radius of phones' unsharp masks and its σ (logarithmic): 0.8 to 2 px."""
-AMOUNT, AMOUNT_SPREAD = 0.6, 0.8
-"""Prior of the amount of phones' unsharp masks and its σ."""
+PRIOR = np.array([AMOUNT, np.log(RADIUS_PX)]), np.array([0.8, 0.45])
+"""Prior of the amount and the logarithm of the radius of phones' unsharp masks, and their σ: 0.8 to 2 px.
+
+Twice and 1.5 times as wide as where frames are restored: what is reported shall be the capture's own."""
 PROFILE_STD = 0.003
 """Misfit of a mean profile, as a fraction of the step, correlated within 1 px."""
 UNSHARPENED_OVERSHOOT, UNSHARPENED_STD, UNSHARPENED_CAPTURES = 0.001, 0.003, 95
@@ -193,8 +187,7 @@ def _significance(edges: EdgeProfiles) -> float:
 
 def sharpened_step(width_px: float, amount: float, radius_px: float) -> Array:
     """z(u) on GRID_PX."""
-    step = ndtr(GRID_PX / width_px)
-    return np.asarray(step + amount * (step - ndtr(GRID_PX / np.hypot(width_px, radius_px))))
+    return edge_profile(GRID_PX, width_px, amount, np.log(radius_px))
 
 
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -223,15 +216,7 @@ def _overshoots(mean: Array) -> Array:
 
 def _fit(mean: Array) -> tuple[Array, Array]:
     """Width, amount, log radius, and their covariance; amount and radius have priors."""
-    share = np.sqrt(GRID_PX[1] - GRID_PX[0]) / PROFILE_STD
-
-    def off(theta: Array) -> Array:
-        model = sharpened_step(theta[0], theta[1], float(np.exp(theta[2])))
-        prior = [(theta[1] - AMOUNT) / AMOUNT_SPREAD, (theta[2] - np.log(RADIUS_PX)) / RADIUS_SPREAD]
-        return np.append(share * (model - mean), prior)
-
-    start = [0.7, 0.3, np.log(RADIUS_PX)]
-    found = least_squares(off, start, bounds=BOUNDS)
+    found = fit_edge(GRID_PX, mean, PROFILE_STD, PRIOR, START, BOUNDS)
     return found.x, np.linalg.pinv(found.jac.T @ found.jac)
 
 

@@ -45,6 +45,7 @@ MAX_MISFIT = 0.02
 """Largest rms of a profile about its fitted step, relative to the step's height; half or twice moves a simulated
 defocus by 0.7 and 0.3 σ."""
 LEAST_WIDTH_PX = 0.05
+"""Bound of the fit: a step of this width is sharp within one pixel; edges that end here are left out."""
 _FIT_STEPS, _FURTHER_STEPS = 12, 3
 """Iterations of the fit from a guess, and from the fit of the same step over a shorter reach."""
 

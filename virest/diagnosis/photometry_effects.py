@@ -27,13 +27,17 @@ Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True, slots=True)
-class _OneValue:
+class OneValue:
     """An effect with a single value, which every profile has."""
 
     name: str
+    key: str
+    """Of the value in the profile."""
     size: float
     """Typical change."""
     bounds: Bounds
+    of_curve: bool = False
+    """Whether the value belongs to the response curve; otherwise to the extensions."""
     per_frame: bool = False
 
     @property
@@ -50,44 +54,18 @@ class _OneValue:
         """The profile's value."""
         return [np.array(list(EFFECTS[self.name].read(profile, profile).values()))]
 
-
-@dataclass(frozen=True, slots=True)
-class ResponseGamma(_OneValue):
-    """An additional gamma on the profile's curve."""
-
-    name: str = "response_curve"
-    size: float = 0.1
-    bounds: Bounds = ((0.2,), (5.0,))
-
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Set response.extra_gamma."""
-        return profile.with_curve(extra_gamma=float(values[0]))
+        """Set the value."""
+        value: dict[str, Any] = {self.key: float(values[0])}
+        return profile.with_curve(**value) if self.of_curve else profile.with_extensions(**value)
 
 
-@dataclass(frozen=True, slots=True)
-class BlackLevel(_OneValue):
-    """Grey level without light; its typical change is 2.5 of 255 levels."""
-
-    name: str = "black_level"
-    size: float = 0.01
-    bounds: Bounds = ((0.0,), (0.5,))
-
-    def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Set response.black_level."""
-        return profile.with_curve(black_level=float(values[0]))
-
-
-@dataclass(frozen=True, slots=True)
-class Vignetting(_OneValue):
-    """Loss of light towards the corners."""
-
-    name: str = "vignetting"
-    size: float = 0.1
-    bounds: Bounds = ((-0.9,), (0.95,))
-
-    def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
-        """Set extensions.vignetting_corner_loss."""
-        return profile.with_extensions(vignetting_corner_loss=float(values[0]))
+RESPONSE_GAMMA = OneValue("response_curve", "extra_gamma", 0.1, ((0.2,), (5.0,)), of_curve=True)
+"""An additional gamma on the profile's curve."""
+BLACK_LEVEL = OneValue("black_level", "black_level", 0.01, ((0.0,), (0.5,)), of_curve=True)
+"""Grey level without light; its typical change is 2.5 of 255 levels."""
+VIGNETTING = OneValue("vignetting", "vignetting_corner_loss", 0.1, ((-0.9,), (0.95,)))
+"""Loss of light towards the corners."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,14 +157,14 @@ class GainDrift:
         return profile.with_extensions(gain=tuple((gain / np.median(gain)).tolist()))
 
 
-PhotometricEffect = ResponseGamma | BlackLevel | Vignetting | Flicker | GainDrift
+PhotometricEffect = OneValue | Flicker | GainDrift
 """One named effect on brightness: its parameters, and their places in a profile."""
 
 
 def photometric_effects(observations: PhotometricObservations, movie_frames: int) -> tuple[PhotometricEffect, ...]:
     """All effects that brightness can reveal; a gain is unexplained only if exposure and ISO are logged."""
     frames = tuple(observations.frames.tolist())
-    common: tuple[PhotometricEffect, ...] = (ResponseGamma(), BlackLevel(), Vignetting(), Flicker())
+    common: tuple[PhotometricEffect, ...] = (RESPONSE_GAMMA, BLACK_LEVEL, VIGNETTING, Flicker())
     return (*common, GainDrift(frames, movie_frames)) if observations.product_known and frames else common
 
 

@@ -28,10 +28,10 @@ from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, Pa
 from virest.diagnosis.isolated_steps import IsolatedSteps
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import (
-    BlackLevel,
+    BLACK_LEVEL,
+    RESPONSE_GAMMA,
     GainDrift,
     PhotometricEffect,
-    ResponseGamma,
     photometric_effects,
 )
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, judge, significance
@@ -56,7 +56,7 @@ EQUAL_RANGE = 0.05
 """Runs whose 5 to 95 % ranges of log exposure × ISO agree to this determine the curve equally well."""
 MIN_OBSERVATIONS = 300
 """Fewest observations of patches, each channel of each frame one, from which a cause is sought."""
-CURVE: dict[str, PhotometricEffect] = {"response_curve": ResponseGamma(), "black_level": BlackLevel()}
+CURVE: dict[str, PhotometricEffect] = {"response_curve": RESPONSE_GAMMA, "black_level": BLACK_LEVEL}
 MAX_CURVE_MEMORY = 0.45
 """Do not fit the curve if the encoder keeps more than this fraction of the last frame: it then keeps more of dark
 patches than of bright ones under any curve, and a black level would only absorb that."""

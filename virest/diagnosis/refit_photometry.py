@@ -23,7 +23,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.diagnosis.findings import Finding
 from virest.diagnosis.photometry import PhotometricObservations
-from virest.diagnosis.photometry_effects import BlackLevel, PhotometricEffect, ResponseGamma
+from virest.diagnosis.photometry_effects import BLACK_LEVEL, RESPONSE_GAMMA, PhotometricEffect
 from virest.diagnosis.photometry_fit import PhotometricFit, fit_photometry, pulls, significance
 from virest.diagnosis.picture_ladder import PictureVerdict, changes_of, frames_of, light_varies, sentence_of, values_of
 
@@ -159,7 +159,7 @@ def _exposure_variance(causes: Sequence[Finding]) -> float:
 def _curve_by_brightness(observations: PhotometricObservations, fitted: PhotometricFit, prior: Array) -> Array:
     """Second moments (3, 3) of the curve changes that the ladder did not report, from a joint fit with the rest."""
     names = [effect.name for effect in fitted.effects]
-    curves: tuple[PhotometricEffect, ...] = (ResponseGamma(), BlackLevel())
+    curves: tuple[PhotometricEffect, ...] = (RESPONSE_GAMMA, BLACK_LEVEL)
     free = [k for k, effect in enumerate(curves) if effect.name not in names]
     spread = np.zeros((3, 3))
     if not free:

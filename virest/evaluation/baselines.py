@@ -19,7 +19,7 @@ from scipy.fft import next_fast_len
 
 from virest.arrays import Array, Picture
 from virest.camera.response import ResponseCurve
-from virest.evaluation.dong2020 import Weights, filtered, poisson_tv_l0
+from virest.evaluation.dong2020 import filtered, poisson_tv_l0
 from virest.image_formation.kernels import KernelField, blur_chords, kernel_field
 from virest.image_formation.row_motion import RowMotion
 from virest.restoration.encoding import encode_picture
@@ -106,7 +106,7 @@ PAPERS: dict[str, Baseline] = {
     ),
     "dong2020": Baseline(
         poisson_tv_l0,
-        tuple(Weights(tv=tv) for tv in (30.0, 90.0, 270.0)),
+        (30.0, 90.0, 270.0),
         "Poisson data, TV and L0 gradients (Dong et al. 2020, Wang's in the paper)",
     ),
 }

@@ -12,7 +12,6 @@ first.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,34 +22,26 @@ Plane = NDArray[np.float32]
 Spectrum = NDArray[Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Weights:
-    """Weights and penalties of the objective."""
-
-    photons: float = 2000.0
-    """Photon count at light 1; the weight of the data term."""
-    tv: float = 60.0
-    l0: float = 1.0
-    iterations: int = 25
-    data_penalty: float = 500.0
-    gradient_penalty: float = 200.0
+PHOTONS = 2000.0
+"""Photon count at light 1; the weight of the data term."""
+ITERATIONS, DATA_PENALTY, GRADIENT_PENALTY = 25, 500.0, 200.0
 
 
-def poisson_tv_l0(observed: Plane, psf: Plane, weights: Weights) -> Plane:
+def poisson_tv_l0(observed: Plane, psf: Plane, tv: float, l0: float = 1.0) -> Plane:
     """Deconvolve light (height, width) ≥ 0 that was convolved with ``psf``, whose origin is at its centre."""
     shape = observed.shape
     kernel = centred_spectrum(psf, shape)
     across, down = (centred_spectrum(np.array(d, np.float32), shape) for d in ([[1, -1, 0]], [[1], [-1], [0]]))
-    data, steep = np.float32(weights.data_penalty), np.float32(weights.gradient_penalty)
+    data, steep = np.float32(DATA_PENALTY), np.float32(GRADIENT_PENALTY)
     system = data * np.abs(kernel) ** 2 + 2 * steep * (np.abs(across) ** 2 + np.abs(down) ** 2)
     sharp: Plane = observed.astype(np.float32)
     duals = [np.zeros(shape, np.float32) for _ in range(3)]
-    for _ in range(weights.iterations):
+    for _ in range(ITERATIONS):
         spectrum = _spectrum(sharp)
         blurred, right, below = (_plane(spectrum * filter_, shape) for filter_ in (kernel, across, down))
-        light = _poisson_step(blurred + duals[0], observed, weights.photons, weights.data_penalty)
-        smooth = _shrunk(right + duals[1], below + duals[2], weights.tv / weights.gradient_penalty)
-        sparse = _thresholded(right, below, weights.l0 / weights.gradient_penalty)
+        light = _poisson_step(blurred + duals[0], observed)
+        smooth = _shrunk(right + duals[1], below + duals[2], tv / GRADIENT_PENALTY)
+        sparse = _thresholded(right, below, l0 / GRADIENT_PENALTY)
         duals = [d + a - b for d, a, b in zip(duals, (blurred, right, below), (light, *smooth), strict=True)]
         targets = (light - duals[0], smooth[0] - duals[1] + sparse[0], smooth[1] - duals[2] + sparse[1])
         scales = (data, steep, steep)
@@ -73,9 +64,9 @@ def filtered(plane: Plane, psf: Plane, factor: Callable[[Spectrum], Spectrum]) -
     return _plane(_spectrum(plane) * factor(centred_spectrum(psf, plane.shape)), plane.shape)
 
 
-def _poisson_step(near: Plane, observed: Plane, photons: float, penalty: float) -> Plane:
+def _poisson_step(near: Plane, observed: Plane) -> Plane:
     """Minimise photons (w − g log w) + penalty/2 (w − near)² over w: the positive root of a quadratic."""
-    ratio = np.float32(photons / penalty)
+    ratio = np.float32(PHOTONS / DATA_PENALTY)
     half = 0.5 * (near - ratio)
     return np.asarray(half + np.sqrt(half * half + ratio * observed), np.float32)
 

@@ -308,7 +308,8 @@ class Paths:
     def centre(self, scene: InertialMotion, velocity: Array) -> Array:
         """Camera's centre (n, 3), world axes."""
         moved = self.path + velocity * self.since_s[:, None] + 0.5 * scene.gravity_m_s2 * self.since_s[:, None] ** 2
-        return moved - self.per_bias @ scene.accel_bias_m_s2 + self.per_delay * scene.accel_delay_s
+        biased = (self.per_bias.reshape(-1, 3) @ scene.accel_bias_m_s2).reshape(-1, 3)
+        return moved - biased + self.per_delay * scene.accel_delay_s
 
     def shared_slopes(self) -> Array:
         """Change (n, 3, 7) of the centre per gravity, accelerometer bias and delay."""

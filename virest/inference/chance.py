@@ -21,6 +21,16 @@ def chi2_median(freedom: int) -> float:
     return float(special.chdtri(freedom, 0.5))
 
 
+def chi2_below(probability: float, freedom: int) -> float:
+    """Value below which a chi-square lies with this probability."""
+    return 2.0 * float(special.gammaincinv(freedom / 2, probability))
+
+
+def gamma_tail(value: float, shape: float, scale: float) -> float:
+    """Probability of a larger value of a gamma distribution."""
+    return float(special.gammaincc(shape, value / scale))
+
+
 def student_tail(value: Any, freedom: Any) -> float:
     """Probability of a larger Student's t."""
     return float(special.stdtr(freedom, -np.asarray(value, float)))
@@ -51,6 +61,19 @@ def t_ratio(values: Array) -> float:
 def chance_of(values: Array) -> float:
     """One-sided p value of a t test that the mean of values (n,) is positive; 0.5 for fewer than three."""
     return student_tail(t_ratio(values), max(len(values) - 1, 1))
+
+
+def chance_of_larger(first: Array, second: Array) -> float:
+    """One-sided p value of Student's t test that the first values (n,) have the larger mean than the second (m,).
+
+    The variances are taken to be equal; nan if either is empty.
+    """
+    freedom = len(first) + len(second) - 2
+    if not len(first) or not len(second) or freedom < 1:
+        return float("nan")
+    squares = sum(float(((values - values.mean()) ** 2).sum()) for values in (first, second))
+    error = np.sqrt(squares / freedom * (1 / len(first) + 1 / len(second)))
+    return student_tail((first.mean() - second.mean()) / max(error, np.finfo(float).tiny), freedom)
 
 
 def beyond_noise(gain: Array) -> float:

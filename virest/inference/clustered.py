@@ -14,6 +14,7 @@ from virest.arrays import Array, Index
 
 RELATIVE_FLOOR = 1e-9
 ABSORBED_FLOOR = 1e-12
+"""Relative eigenvalue below which a direction is rounding error."""
 LEAST_LEFT = 0.05
 """Smallest part of a group's scatter that a fit leaves; a value with less comes from one group alone."""
 

@@ -18,6 +18,8 @@ from virest.capture.imu import ImuSamples
 from virest.inference.frame_rotations import FrameRotations, gyro_turns
 from virest.motion.integration import integrate_gyro
 
+SEARCH_S = 1.0
+"""Range of the search on both sides: twice the largest offset of the real captures, nearly half a second."""
 STEP_S = 0.004
 """Of the searched offsets; half or twice changes no fit that starts there (two simulated captures)."""
 MIN_COVERED = 0.75
@@ -109,7 +111,7 @@ def align_coarsely(
     turns: FrameRotations,
     imu: ImuSamples,
     profile: CameraProfile,
-    search_s: float = 1.0,
+    search_s: float = SEARCH_S,
     *,
     own_axes: bool = False,
     free_focal: bool = False,

@@ -68,7 +68,7 @@ class TriangulatedPoints:
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class SightedPoints:
     """Triangulated points with their first observation."""
 
     points: TriangulatedPoints
@@ -86,9 +86,9 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.pair)
 
-    def chosen(self, use: Mask) -> Sightings:
+    def chosen(self, use: Mask) -> SightedPoints:
         """Some of the points."""
-        return Sightings(
+        return SightedPoints(
             self.points.chosen(use), self.pair[use], self.from_m[use], self.rays[use], self.above_per_m[use],
             self.across[use],
         )  # fmt: skip
@@ -129,7 +129,7 @@ def triangulate(known: IntegratedMotion, scene: InertialMotion, table: TrackTabl
     return sights.points.chosen(near & (sights.points.std_per_m < MAX_RELATIVE_STD * expected))
 
 
-def triangulate_relief(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> Sightings:
+def triangulate_relief(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> SightedPoints:
     """Find the inverse depth of every matched point that the parallax determines, at any distance from the plane.
 
     Points off their parallax line are dropped: they are mismatches or move independently.
@@ -146,7 +146,9 @@ def triangulate_relief(known: IntegratedMotion, scene: InertialMotion, table: Tr
     return replace(sights, points=replace(sights.points, place_m=place, inverse_depth_per_m=far))
 
 
-def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, passes: int, reach: float) -> Sightings:
+def _sights(
+    known: IntegratedMotion, scene: InertialMotion, table: TrackTable, passes: int, reach: float
+) -> SightedPoints:
     """Gauss-Newton on the inverse depth of each point, from its window's plane; a pass changes it by at most ``reach``.
 
     The standard deviation is the pair's tracking noise over the parallax.
@@ -162,7 +164,7 @@ def _sights(known: IntegratedMotion, scene: InertialMotion, table: TrackTable, p
     depth, std, across = view.inverse_depths(expected, passes, reach)
     safe = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
     points = TriangulatedPoints(table.window, centre_1 + way / safe[:, None], poses.first_s, depth, std)
-    return Sightings(points, table.pair, centre_1, rays, depth - expected, across)
+    return SightedPoints(points, table.pair, centre_1, rays, depth - expected, across)
 
 
 @dataclass(frozen=True, slots=True)

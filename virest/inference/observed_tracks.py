@@ -24,8 +24,11 @@ MIN_TRACKS = 15
 WINDOW_S = 3.5
 """Longest time over which accelerations are integrated to a path; the path's noise grows with time to the power 1.5."""
 IMU_PAUSE_PERIODS = 3.0
+"""Median periods between samples above which the inertial data have a pause; shorter than where a log is split."""
 MARGIN_S = 0.02
+"""Time at both ends of a pair by which fits may move the clocks, and the shortest pause."""
 CELLS, LEAST_IN_CELL, ASTRAY, MOST_ASTRAY = 8, 10, 2.5, 0.5
+"""Cells along each side, points of a cell that is judged, and the limits of :meth:`ObservedTracks.astray_cells`."""
 
 
 @dataclass(frozen=True, slots=True)

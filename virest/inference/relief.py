@@ -19,7 +19,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from virest.arrays import Array, Index, Mask
 from virest.image_formation.point_model import SMALLEST_DEPTH
-from virest.inference.depth import NEAR_S, OUTSIDE, Sightings
+from virest.inference.depth import NEAR_S, OUTSIDE, SightedPoints
 from virest.inference.robust import CAUCHY
 from virest.inference.time_blocks import evenly_chosen
 from virest.motion.optics import MovingLens
@@ -107,7 +107,7 @@ def picture_grid(lens: MovingLens, time_s: float) -> Grid:
 # ── roughness ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def measure_roughness(sights: Sightings, grid: Grid) -> Roughness | None:
+def measure_roughness(sights: SightedPoints, grid: Grid) -> Roughness | None:
     """Fit the variogram of a window's points to differences between points of the same frame; None: too few.
 
     ½ Δ² minus the two points' own variances is averaged over distance classes; sill and nugget are fitted by least
@@ -197,7 +197,7 @@ class PointsInFrame:
         return PointsInFrame(self.place[use], self.above_per_m[use], self.variance[use])
 
 
-def points_in_frame(sights: Sightings, view: View, prior: ReliefPrior) -> PointsInFrame:
+def points_in_frame(sights: SightedPoints, view: View, prior: ReliefPrior) -> PointsInFrame:
     """Transform the window's points into a frame's camera axes.
 
     A point seen from another position may be occluded in this frame.  The surface visible instead has moved relative to
@@ -219,7 +219,7 @@ def points_in_frame(sights: Sightings, view: View, prior: ReliefPrior) -> Points
     return PointsInFrame(place, inverse - rays @ view.plane_per_m, std**2 + rough.lost(parallax))
 
 
-def _seen_nearby(sights: Sightings, view: View, prior: ReliefPrior) -> Index:
+def _seen_nearby(sights: SightedPoints, view: View, prior: ReliefPrior) -> Index:
     """Index of the points seen from nearby, chosen by pairs of frames, nearest first.
 
     Takes pairs until there are ENOUGH_POINTS, and further ones whose parallax of the sill is below NEARBY.
@@ -370,7 +370,7 @@ def _cells(place: Array, grid: Grid) -> tuple[Index, Mask]:
 class WindowRelief:
     """Relief on the planes of a window."""
 
-    sights: Sightings
+    sights: SightedPoints
     """All tracked points of the window."""
     prior: ReliefPrior
 
@@ -380,7 +380,7 @@ class WindowRelief:
         return fit_surface(seen, self.prior) if len(seen.place) >= MIN_POINTS else None
 
 
-def find_relief(sights: Sightings, grid: Grid, view: Callable[[float], View]) -> WindowRelief | None:
+def find_relief(sights: SightedPoints, grid: Grid, view: Callable[[float], View]) -> WindowRelief | None:
     """Measure the roughness of a window's scene, and keep surfaces if they predict held-out points better than planes.
 
     view: the camera's pose at a time, with its frame's plane.

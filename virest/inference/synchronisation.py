@@ -16,7 +16,7 @@ from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
-from virest.inference.coarse_alignment import MIN_EXPLAINED, MIN_MOTION_PX, MIN_PAIRS, STEP_S, align_coarsely
+from virest.inference.coarse_alignment import MIN_EXPLAINED, MIN_MOTION_PX, MIN_PAIRS, SEARCH_S, STEP_S, align_coarsely
 from virest.inference.frame_rotations import FrameRotations, gyro_turns
 from virest.inference.observed_tracks import MIN_TRACKS, ObservedTracks
 from virest.inference.profile_terms import CLOCK_SKEW, SMALL_BIAS, careful_terms, shift_offset
@@ -105,7 +105,7 @@ class Agreement:
 
 
 def estimate_time_offset(
-    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float = SEARCH_S
 ) -> OffsetEstimate:
     """Find the time offset within ± search_s of the profile's (of 0 if unknown), and the gyroscope's bias.
 
@@ -228,9 +228,7 @@ def _too_few(observed: ObservedTracks, imu: ImuSamples) -> str:
 # ── agreement ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def check_agreement(
-    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float = 1.0
-) -> Agreement:
+def check_agreement(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> Agreement:
     """Check whether the frames rotate as the gyroscope measures at the profile's offset ± AGREEMENT_SLACK_S.
 
     Bias and steady drift are free; moving objects and parallax have little weight.  Too few data count as agreement,
@@ -243,7 +241,7 @@ def check_agreement(
     if max(_rms(seen_px), _rms(predicted_px)) < MIN_MOTION_PX:
         return Agreement(True, "too little motion to tell")
     free_focal = profile.intrinsics is None
-    coarse = align_coarsely(turns, imu, profile, search_s, own_axes=True, free_focal=free_focal)
+    coarse = align_coarsely(turns, imu, profile, own_axes=True, free_focal=free_focal)
     explained = -np.inf if coarse is None else coarse.explained_near(offset_s, AGREEMENT_SLACK_S)
     if coarse is None or not np.isfinite(explained):
         return Agreement(True, "too few data to tell: no inertial data at the frames")
@@ -254,7 +252,7 @@ def check_agreement(
     if elsewhere is not None:
         hint = f"at an offset of {elsewhere:+.3f} s it would explain {coarse.explained:.0%}"
     else:
-        hint = _with_other_axes(observed, imu, profile, search_s)
+        hint = _with_other_axes(observed, imu, profile, SEARCH_S)
         hint = hint or "was the movie stabilised in the camera, or is it from another recording?"
     reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the frames' rotation: {hint}"
     return Agreement(False, reason, explained=explained, best_offset_s=elsewhere)

@@ -21,6 +21,7 @@ from virest.inference.travel_direction import find_directions, without_direction
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 SMALLEST_SCALE = 0.03
+"""Least factor on the tracking noise: points without noise, as in tests, fit better than any that are tracked."""
 STALE = {Slopes.ON_THE_WAY: (1.5, 0.5), Slopes.AT_THE_END: (0.1, 0.05), Slopes.HERE: (0.0, 0.0)}
 """Reuse the Jacobian until points move this far (median, px) or the scene changes by this fraction."""
 ANY_DEPTH = 1e6
@@ -127,8 +128,8 @@ class TrackEvidence:
             limit += list(scene.limits())
             prior += list(scene.prior_std() ** -2.0)
             off += list(scene.vector() - self.start.vector())
-        rows = self.whitened(state, look.prediction, look.slope)
-        left = self.whitened(state, look.prediction, difference[..., None])[..., 0]
+        whiten = self.whitening(state, look.prediction)
+        rows, left = whiten @ look.slope, np.einsum("nij,nj->ni", whiten, difference)
         squared = (left**2).sum(axis=-1)
         typical = NORMAL_MEDIAN if state.depth_spread == ANY_DEPTH else RAYLEIGH_MEDIAN
         scale = max(float(np.median(np.sqrt(squared))) / typical, SMALLEST_SCALE)
@@ -141,16 +142,15 @@ class TrackEvidence:
         found = replace(state, scene=scene)
         return System(found, look, rows, left, squared, scale, np.array(prior), np.array(off), np.array(limit))
 
-    def whitened(self, state: State, at: Prediction, columns: Array) -> Array:
-        """Columns (n, 2, k), px, divided by the standard deviations of the predicted points."""
+    def whitening(self, state: State, at: Prediction) -> Array:
+        """Matrices (n, 2, 2), 1/px, that divide by the standard deviations of the predicted points."""
         noise = self.table.noise_px[self.table.pair]
-        columns = columns / noise[:, None, None]
+        whole = np.eye(2) / noise[:, None, None]
         if at.along_px is None:
-            return columns
+            return np.asarray(whole)
         length, way = lengths_and_ways(at.along_px)
         shrink = 1 - 1 / np.sqrt(1 + (state.depth_spread * length / noise) ** 2)
-        along = np.einsum("ni,nik->nk", way, columns)
-        return np.asarray(columns - way[:, :, None] * (shrink[:, None] * along)[:, None, :])
+        return np.asarray(whole - ((shrink / noise)[:, None] * way)[:, :, None] * way[:, None, :])
 
     def moved(self, state: State, step: Array) -> State:
         """The state after a step: of the terms' values, then of the scene's."""

@@ -281,7 +281,7 @@ def _moved_by(evidence: TrackEvidence, system: TrackSystem, inverse: Array, erro
     """Changes (k, m) of the values by errors (m, n, 2) of the points; 0 for errors of no points."""
     if errors_px is None or not errors_px.shape[1]:
         return np.zeros((len(system.prior), 0 if errors_px is None else len(errors_px)))
-    errors = evidence.whitened(system.state, system.look.prediction, np.moveaxis(errors_px, 0, -1))
+    errors = evidence.whitening(system.state, system.look.prediction) @ np.moveaxis(errors_px, 0, -1)
     return np.asarray(inverse @ system.pull(errors))
 
 

@@ -11,12 +11,14 @@ from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.tracking import TrackPair
 
 REWEIGHTINGS = 6
+"""Half as many change the noise of `sample_data/text` by up to 1.3 %, twice as many by 0.2 %."""
 POINTS_PER_TERM = 4
 """Points needed per term of the flow (a cubic has 10 per axis); otherwise a lower order is used."""
 ENOUGH_POINTS = 36
 """With fewer points, a flow of low order cannot follow a rotating camera, so the pair takes the others' noise."""
 ORDERS = (3, 2, 1)
 SMALLEST_NOISE_PX = 0.01
+"""Two of the steps, 0.005 px, at which the tracker ends."""
 
 
 def step_noise_px(pairs: Sequence[TrackPair]) -> Array:

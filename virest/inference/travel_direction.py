@@ -81,13 +81,14 @@ def _tangents(direction: Array) -> Array:
 
 def _dotted(pair: Array, rows: Array) -> Array:
     """(n, k): pairs (n, 2) times rows (n, 2, k)."""
-    return pair[:, :1] * rows[:, 0] + pair[:, 1:] * rows[:, 1]
+    return np.asarray(np.einsum("ni,nik->nk", pair, rows))
 
 
 def _members(group: Index, groups: int) -> csr_array:
     """(groups, n): 1 where a row belongs to a group."""
-    count = len(group)
-    return csr_array((np.ones(count), (group, np.arange(count))), (groups, count))
+    order, count = np.argsort(group, kind="stable"), len(group)
+    begin = np.searchsorted(group[order], np.arange(groups + 1))
+    return csr_array((np.ones(count), order, begin), (groups, count))
 
 
 def _group_sum(values: Array, belongs: csr_array) -> Array:

@@ -18,12 +18,12 @@ is neglected.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import ndtr
 
 from virest.arrays import Array, Picture
@@ -37,6 +37,8 @@ RADIUS_PX, RADIUS_SPREAD = 1.2, 0.3
 """Prior mean and standard deviation (of the logarithm) of the radius of phones' unsharp masks: 0.9 to 1.6 px."""
 AMOUNT, AMOUNT_SPREAD = 0.6, 0.4
 """Prior mean and standard deviation of the amount of phones' unsharp masks."""
+START = (0.7, 0.3, np.log(RADIUS_PX))
+"""Edge width, amount and log radius at which fits begin."""
 FALSE_ALARM = 5e-3
 """Probability that unsharpened pictures are classified as certainly sharpened.  Missing a mask costs up to 2 dB for
 short blur; undoing one that does not exist costs a few tenths of a dB."""
@@ -53,7 +55,9 @@ out of focus; excludes the scatter from the number of edges.  ``python -m virest
 others.  The largest are 0.009, of a board at 320 x 240, and 0.025.  The profile to which the mask is fitted may be off
 by the same standard deviation as the sharpest edges: neighbours within 1 px share the error."""
 EDGES = EdgeSettings(edges_per_frame=600, cell_px=16, min_slope_levels=6.0)
+"""The smallest step that counts has this slope at a width of 1.7 px, with the search's smoothing 2 px."""
 MOST_FRAMES = 4
+"""Frames that are searched for edges: 600 each, where LEAST_EDGES suffice."""
 STILL_PX = 0.6
 """Edges across which the blur path's standard deviation is below this are used."""
 SHARPEST = 0.4
@@ -70,9 +74,11 @@ EDGES_PER_SAMPLE = 4
 MEDIAN_STD = 1.2533
 """Standard deviation of the median over that of the mean, for normal deviates."""
 ALONG_PX = np.arange(-9.0, 9.0 + 1e-9, 0.5)
+"""Half a pixel apart; beyond FLAT_FROM_PX there are 11 samples of the plateau."""
 FLAT_FROM_PX, MAX_FLAT_RMS = 4.0, 0.04
 """Start of the plateau, and its largest rms relative to the step."""
 MIN_STEP_LEVELS = 30.0
+"""Noise of one grey level is 3 % of it, within MAX_FLAT_RMS."""
 UNCLIPPED_LEVELS = (6.0, 249.0)
 """Range of an unclipped plateau.  The overshoot itself may be clipped, so that the mask is underestimated."""
 MAX_OFF_PX = 1.5
@@ -178,6 +184,45 @@ def without_mask(picture: Picture, mask: UnsharpMask) -> Picture:
     return undone
 
 
+def edge_profile(
+    u_px: Array,
+    width: float,
+    amount: float,
+    log_radius: float,
+    line: float = np.inf,
+    contrast: float = 1.0,
+    middle: float = 0.0,
+) -> Array:
+    """z(u) at distances u_px from the middle of an edge, which moves it to −middle; line: infinite for a step."""
+    u = u_px + middle
+
+    def spread(by: float) -> Array:
+        return np.asarray(contrast * (ndtr(-u / by) - ndtr(-(u + line) / by)))
+
+    seen = spread(width)
+    return np.asarray(1 - seen - amount * (seen - spread(float(np.hypot(width, np.exp(log_radius))))))
+
+
+def fit_edge(
+    u_px: Array,
+    mean: Array,
+    misfit_std: float,
+    prior: tuple[Array, Array],
+    start: Sequence[float],
+    bounds: tuple[Sequence[float], Sequence[float]],
+) -> OptimizeResult:
+    """The arguments of :func:`edge_profile` that fit a mean profile, as many as the start has.
+
+    misfit_std: of the model, correlated within 1 px.  prior: means and standard deviations of all but the edge width.
+    """
+    share = np.sqrt(u_px[1] - u_px[0]) / misfit_std
+
+    def off(theta: Array) -> Array:
+        return np.append(share * (edge_profile(u_px, *theta) - mean), (theta[1:] - prior[0]) / prior[1])
+
+    return least_squares(off, start, bounds=bounds)
+
+
 # ── parts ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -237,14 +282,10 @@ def _overshoot(profiles: Array, bare_std: float) -> tuple[float, float]:
 
 def _fitted(mean: Array) -> Array:
     """Fitted edge width, amount, log radius, line width, contrast and middle; all but the edge width have priors."""
-    share = np.sqrt(GRID_PX[1] - GRID_PX[0]) / BARE_SHARPEST[1]
-
-    def off(theta: Array) -> Array:
-        misfit = share * (_beside_line(theta) - mean)[FITTED]
-        held = (theta[1:] - _USUAL) / _SPREAD
-        return np.append(misfit, held)
-
-    tries = [least_squares(off, [0.7, 0.3, np.log(RADIUS_PX), width, 1.0, 0.0], bounds=_BOUNDS) for width in (2.0, 5.0)]
+    starts = ([*START, width, 1.0, 0.0] for width in (2.0, 5.0))
+    tries = [
+        fit_edge(GRID_PX[FITTED], mean[FITTED], BARE_SHARPEST[1], (_USUAL, _SPREAD), start, _BOUNDS) for start in starts
+    ]
     return np.asarray(min(tries, key=lambda found: float(found.cost)).x)
 
 
@@ -257,11 +298,4 @@ first, of the edge width."""
 
 def _beside_line(theta: Array) -> Array:
     """z(u) on GRID_PX."""
-    width, amount, log_radius, line, contrast, middle = theta
-    u = GRID_PX + middle
-
-    def spread(by: float) -> Array:
-        return np.asarray(contrast * (ndtr(-u / by) - ndtr(-(u + line) / by)))
-
-    seen = spread(width)
-    return np.asarray(1 - seen - amount * (seen - spread(float(np.hypot(width, np.exp(log_radius))))))
+    return edge_profile(GRID_PX, *theta)

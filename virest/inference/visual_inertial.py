@@ -21,7 +21,7 @@ from virest.capture.records import Frame
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, with_profile
 from virest.inference.camera_travel import Stretch, VisualInertialAlignment, Window
 from virest.inference.coarse_alignment import MIN_PAIRS
-from virest.inference.depth import Sightings, triangulate, triangulate_relief
+from virest.inference.depth import SightedPoints, triangulate, triangulate_relief
 from virest.inference.observed_tracks import WINDOW_S, ObservedTracks
 from virest.inference.profile_terms import FOCAL, NEAR_AXES, SMALL_BIAS, STATED_OFFSET, TIME_OFFSET, UNKNOWN_READOUT
 from virest.inference.relief import View, WindowRelief, find_relief, picture_grid
@@ -180,7 +180,7 @@ def _fit_stretch(
     return replace(stretch, windows=windows, reliefs=reliefs)
 
 
-def _relief(stretch: Stretch, sights: Sightings, window: int) -> WindowRelief | None:
+def _relief(stretch: Stretch, sights: SightedPoints, window: int) -> WindowRelief | None:
     """Relief on a window's planes, if it predicts held-out points better."""
     if not stretch.windows[window].usable:
         return None

@@ -65,7 +65,7 @@ class Displacement:
 def _parts(values: Array) -> tuple[Array, Array, Array]:
     """The spline's values (..., 15) as position (..., 3), bias (..., 3, 3) and delay (..., 3) parts."""
     rows = values.reshape(*values.shape[:-1], 3, 5)
-    return rows[..., 0], rows[..., 1:4], rows[..., 4]
+    return rows[..., 0], np.ascontiguousarray(rows[..., 1:4]), rows[..., 4]
 
 
 def force_at_samples(imu: ImuSamples) -> tuple[Array, Array] | None:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, cont2discrete, lfilter, lfilter_zi, sosfilt
 
 from virest.arrays import Array
 from virest.simulation.hand_motion import FINE_STEP_S
@@ -27,6 +26,8 @@ def low_passed_rate(
     removed_delay_s: filter delay that the recorder subtracts from the timestamps, see :func:`usual_delay_s`.  Each
     filter is solved exactly for a rate that is linear within steps of FINE_STEP_S.
     """
+    from scipy.signal import butter, cont2discrete, lfilter, lfilter_zi  # with it all of `scipy.stats` is loaded
+
     begin_s = time_s[0] + removed_delay_s - sum(SETTLING_PERIODS / corner for corner in corners_hz)
     fine_s = np.arange(begin_s, time_s[-1] + removed_delay_s + 2 * FINE_STEP_S, FINE_STEP_S)
     filtered = rate_rad_s(fine_s)
@@ -76,6 +77,8 @@ def gyro_noise(
     952-1997, angle random walk).  Data sheets give 0.0001 to 0.0003 for a phone's gyroscope at rest; vibration adds to
     it.  Corners at or above half the sampling rate have no effect.
     """
+    from scipy.signal import butter, sosfilt
+
     noise = density * np.sqrt(rate_hz / 2) * rng.normal(size=shape)
     for corner_hz in corners_hz:
         if corner_hz < rate_hz / 2:

@@ -6,6 +6,7 @@ import errno
 import signal
 import sys
 from collections.abc import Callable
+from functools import cache
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -99,6 +100,7 @@ def _terminate(number: int, _frame: Any) -> NoReturn:
     raise _Terminated(number)
 
 
+@cache
 def program() -> Any:
     """The command tree for the parser; arguments are shown by name, without their Python type."""
     command = typer.main.get_command(app)

@@ -16,19 +16,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from virest.arrays import Array, Index
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
+from virest.diagnosis.field.form_list import LEAST_FOCUS_CHANGE
 from virest.diagnosis.field.screening import Design, Scored, score_forms
 from virest.diagnosis.field.words import SAMPLES, curve_shape
 from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
 from virest.diagnosis.local_blur import LENS_SIGMA_PX, LENS_STD_PX, BlurObservations, predicted_blur
 from virest.diagnosis.local_blur_model import fitted_width
 from virest.image_formation.light import defocus_px
-from virest.inference.chance import t_ratio
+from virest.inference.chance import student_tail, t_ratio
 from virest.inference.clustered import scatter
 from virest.inference.descent import Residuals, Slopes, System, descend
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
@@ -43,7 +43,8 @@ RADIUS_KNOTS, FOCUS_KNOTS, TIME_STEP_S, LEAST_TIMES, MOST_TIMES = 9, 4, 0.2, 5, 
 MIN_SIZE_PX = float(np.sqrt((LENS_SIGMA_PX + 3 * LENS_STD_PX) ** 2 - LENS_SIGMA_PX**2))
 """Standard deviation (0.83 px) of the added Gaussian, which widens edges by 3 σ of the width variation due to coding.
 On 41 simulated captures without such a blur the largest was 0.50 px."""
-LEAST_CHANGE, LEAST_SCALE_PX, BEATEN_T = 0.05, 1e-6, 2.0
+LEAST_SCALE_PX, BEATEN_T = 1e-6, 2.0
+"""Guard against a division by zero; standard errors by which a form with more numbers must beat a simpler one."""
 MIN_GAIN = 0.02
 CAP, BOUND, LEAST_WIDTH_PX = 10.0, 3.0, 0.2
 """Residual cap, in σ; influence bound of one edge, in σ; and minimum edge width."""
@@ -223,7 +224,7 @@ def _outlier_frame_p(left: Array, block: Index) -> float:
     mean = np.bincount(block, bounded - np.median(bounded)) / np.sqrt(count)
     spread = max(robust_std(mean - np.median(mean)), float(bounded.std()))
     most = float(np.abs(mean - np.median(mean)).max()) / max(spread, 1e-9)
-    return min(1.0, 2 * len(count) * float(stats.t.sf(most, len(count) - 1)))
+    return min(1.0, 2 * len(count) * student_tail(most, len(count) - 1))
 
 
 def _indistinguishable(best: Scored, other: Scored) -> bool:
@@ -260,7 +261,7 @@ def _forms(seen: BlurObservations, profile: CameraProfile, capture: Capture) -> 
     yield _Form("time", knots, np.eye(count), cardinal_weights(tuple(knots), edges.stamp_s, 1), frame, own)
     log = [(f.time_s, f.focus_dioptres) for f in capture.frames if f.focus_dioptres is not None]
     values = np.array([value for _, value in log], float)
-    if len(log) > 0.5 * len(capture.frames) and np.ptp(values) > LEAST_CHANGE:
+    if len(log) > 0.5 * len(capture.frames) and np.ptp(values) > LEAST_FOCUS_CHANGE:
         times = np.array([time_s for time_s, _ in log])
         knots = np.linspace(values.min(), values.max(), FOCUS_KNOTS)
         weights = cardinal_weights(tuple(knots), np.interp(edges.stamp_s, times, values), 1)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from virest.arrays import Array, Mask
 from virest.camera.field import AXES, cardinal_weights
@@ -24,6 +23,7 @@ from virest.diagnosis.field.stretches import bridging_form, rate_walk, touching
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, fit_model, make_evidence
 from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
 from virest.image_formation.point_model import TrackTable, integrate_motion, seen_s
+from virest.inference.chance import chance_of_larger
 from virest.inference.comparable_noise import noise_distances
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.observed_tracks import ObservedTracks
@@ -198,4 +198,4 @@ def _larger_residual_p(distance: Array, table: TrackTable, hit: Mask) -> float:
     numbers = np.unique(table.pair)
     medians = np.array([np.median(distance[table.pair == number]) for number in numbers])
     inside, size = hit[numbers], np.log(np.maximum(medians, np.finfo(float).tiny))
-    return float(stats.ttest_ind(size[inside], size[~inside], alternative="greater").pvalue)
+    return chance_of_larger(size[inside], size[~inside])

@@ -19,6 +19,7 @@ from virest.inference.track_fit import TrackFit
 from virest.motion.scene_motion import DirectedMotion
 
 STABILISER_CUTOFFS_HZ = (0.3, 1.0, 4.0)
+"""From slow drift to hand shake, a factor of about 3 apart: a first-order filter's response changes over a decade."""
 NAMED = (
     terms_of.TIME_OFFSET,
     terms_of.CLOCK_SKEW,

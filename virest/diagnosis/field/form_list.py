@@ -34,6 +34,7 @@ SINH_SPACING = 3.0
 FRAMES_PER_STEP, MOST_STEPS = 2, 100
 """Frames between the instants at which a sudden change is searched for, and the maximum number of instants."""
 LEAST_REACH_RAD_S = 0.1
+"""Least range of the knots over a rate: a phone that is held still turns more slowly."""
 LEAST_FOCUS_CHANGE = 0.05
 """Dioptres; a smaller focus change shifts no point by 1 px."""
 READOUTS = frozenset({"readout_time", f"delay{OVER}row"})

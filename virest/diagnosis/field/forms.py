@@ -171,5 +171,7 @@ def _adds_to(field: Field, known: Field) -> bool:
 
 def _at_knots(before: Field, field: Field) -> Array:
     """Values (knots, components) of a field at another's knots."""
+    if before.knots == field.knots:
+        return np.array(before.values)
     grid = np.meshgrid(*field.knots, indexing="ij")
     return before.at(*(axis.ravel() for axis in grid))

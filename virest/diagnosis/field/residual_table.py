@@ -26,6 +26,7 @@ ORDER = ("frame", "time")
 MOST_ROWS, LEAST_ROWS = 20_000, 100
 KNOTS, PLACE_KNOTS, PAIR_KNOTS, MOST_PAIRS = 6, 4, 4, 10
 MIN_VARIATION = 1e-6
+"""A column that varies less is constant, but for rounding."""
 BLOCKS, LEAST_BLOCKS = 40, 8
 MAX_FINDINGS = 6
 MAX_PX = 1e6
@@ -33,6 +34,7 @@ MAX_PX = 1e6
 MIN_SIZE_PX = 0.01
 """Smaller structure does not affect a calibration."""
 LEAST_SCALE_PX = 1e-9
+"""Guard against a division by zero."""
 SHIFT = "points are shifted by up to {size} {shape} of {name}, the same everywhere in the frame"
 QUANTITY = "residual_rms_px"
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from virest.arrays import Array
 from virest.capture.records import Capture
@@ -17,15 +16,18 @@ from virest.diagnosis.field.design import PointResiduals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, step_forms
 from virest.diagnosis.field.forms import FieldForm
 from virest.image_formation.point_model import seen_s
+from virest.inference.chance import student_tail
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
 FALSE_ALARM_RATE = 1e-4
 """Family-wise false-alarm rate over all pairs of a capture."""
 LEAST_POINTS, LEAST_PAIRS = 8, 15
+"""Points of a pair whose growth is measured, and pairs among which one may be an outlier."""
 INSTANTS, REACH = 97, FRAMES_PER_STEP + 1.0
 """Number of instants tried, and the search range in frames before and after: the coarse search ignores FRAMES_PER_STEP
 frames around a change, and its instants are off by up to half of that."""
 LEAST_SCALE = 1e-9
+"""Guard against a division by zero."""
 _ITERATIONS = 8
 
 
@@ -55,7 +57,7 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     spread = robust_std(growth - middle)
     most = int(np.argmax(np.abs(growth - middle)))
     ratio = abs(growth[most] - middle) / max(spread, 1e-12)
-    p_value = min(2 * len(pairs) * float(stats.t.sf(ratio, len(pairs) - 1)), 1.0)
+    p_value = min(2 * len(pairs) * student_tail(ratio, len(pairs) - 1), 1.0)
     if p_value > FALSE_ALARM_RATE:
         return None
     inside = table.pair == pairs[most]

@@ -29,7 +29,9 @@ MIN_EXPLAINED_OVER_FRAME = 0.9
 """The same for a displacement over the frame."""
 OFF_CENTRE, LINEAR, RADIAL = "growing with its square", "linear", "radial"
 SAMPLES = 101
+"""Steps of 1 % of the range."""
 STICKING_FRACTION = 0.5
+"""Part of the largest error that must be reached near rest for a gyroscope to stick there."""
 INERTIAL = "inertial_rows"
 
 
