@@ -51,7 +51,6 @@ JUDGED = 2
 BLOCKS = 8
 POINTS, START_POINTS, STARTS = 1500, 400, 2
 """Number of points in a fit, and in the ranking of starting values; number of starting values that are fitted."""
-MAX_ITERATIONS = 10
 TRANSLATION_GAIN = 0.9
 """Include camera translation if it reduces the residual below this fraction of that of rotation alone."""
 
@@ -184,9 +183,7 @@ class _Search:
         """Fit the nuisances and the causes; use: (n,) fit these points only, without covariances."""
         table = self.table if use is None else self.table.chosen(use)
         terms = (*self.nuisances, *(cause.term for cause in start.causes))
-        return fit_tracks(
-            self.imu, table, start.profile, terms, start.scene, max_iterations=MAX_ITERATIONS, covariances=use is None
-        )
+        return fit_tracks(self.imu, table, start.profile, terms, start.scene, covariances=use is None)
 
     def add_causes(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
         """Add causes one by one; returns the fit with all of them, and the causes."""
