@@ -16,12 +16,12 @@ import numpy as np
 from virest.arrays import Array
 from virest.image_formation.neighbour import turn_jacobian_px
 from virest.image_formation.row_motion import FurtherTurn, RowMotion
-from virest.inference.chance import chi2_median, chi2_tail
+from virest.inference.chance import chi2_median, chi2_tail, student_deviation
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.registration import PairTurn
 
 FALSE_ALARM = 1e-3
-"""Probability of correcting a correct prediction."""
+"""Probability of correcting a correct prediction, and of finding a bias that there is not."""
 NEGLIGIBLE_PX = 0.05
 """Path error below which nothing is corrected: it spoils 0.2 % of the power at 0.5 cycles per pixel (|2πf δ|² / 12),
 less than any movie's noise.  Rows misplaced by δ rms spoil as much as a path that is √12 δ too long."""
@@ -35,6 +35,8 @@ HALF_SPACING = 0.25
 LAG_STD_S, PART_STD, BIAS_STD_RAD_S = 0.003, 0.1, 0.02
 """Priors: recorders stamp frames and samples to a few milliseconds; a stabiliser or low pass removes about a tenth of
 the rotation from the picture or the log; the bias of phones' gyroscopes is below 0.02 rad/s."""
+LARGEST_BIAS = 3.0
+"""Largest bias, in deviations of its prior."""
 MOST_REMAINING = 0.5
 """Use the fitted lag and part if they reduce the interpolation error's variance below this fraction.  A stabiliser that
 cancels only slow rotation is no function of the rate, and a fit of two values always reduces the variance a little
@@ -192,23 +194,32 @@ def missing_turn(
 
 
 def following_turn(turns: Sequence[PairTurn], trajectory: Trajectory) -> FollowingTurn:
-    """Fit bias, lag and part to pairs' missing rates, with their priors (ridge regression)."""
-    design = np.concatenate([np.column_stack((np.eye(3), *_change_and_mean(turn, trajectory))) for turn in turns])
+    """Fit the lag and the part to pairs' missing rates, with their priors (ridge regression)."""
+    design = np.concatenate([np.stack(_change_and_mean(turn, trajectory), -1) for turn in turns])
     rates = np.concatenate([turn.rate_rad_s for turn in turns])
     left = rates - design @ np.linalg.lstsq(design, rates, rcond=None)[0]
-    variance = max(float(left @ left) / max(len(left) - 5, 1), 1e-12)
-    usual = np.diag([*[1 / BIAS_STD_RAD_S**2] * 3, 1 / LAG_STD_S**2, 1 / PART_STD**2])
-    x, y, z, lag_s, part = np.linalg.solve(design.T @ design / variance + usual, design.T @ rates / variance).tolist()
-    return FollowingTurn((x, y, z), lag_s, part)
+    variance = max(float(left @ left) / max(len(left) - 2, 1), 1e-12)
+    usual = np.diag([1 / LAG_STD_S**2, 1 / PART_STD**2])
+    lag_s, part = np.linalg.solve(design.T @ design / variance + usual, design.T @ rates / variance)
+    return FollowingTurn(lag_s=float(lag_s), part=float(part))
 
 
-def biased_turn(turns: Sequence[PairTurn]) -> FollowingTurn:
-    """The bias alone: the median of pairs' missing rates, shrunk towards 0 by its variance (π / 2n of one pair's)."""
-    rates = np.array([turn.rate_rad_s for turn in turns])
-    middle = np.median(rates, axis=0)
-    variance = np.median(((rates - middle) ** 2).sum(axis=1)) / chi2_median(3) * np.pi / 2 / len(rates)
+def with_bias(following: FollowingTurn, turns: Sequence[PairTurn], trajectory: Trajectory) -> FollowingTurn:
+    """With the bias of the rest: its median over the pairs, shrunk towards 0 by that median's variance.
+
+    0 if the median may be due to chance, or is beyond any gyroscope's bias: parallax of a near scene lasts for a few
+    frames too, but changes, and is followed from frame to frame.  The variance is π / 2n of one pair's, times that of
+    Student's distribution, since few pairs hardly show their scatter.
+    """
+    rates = np.array([following.residual_of(turn, trajectory).rate_rad_s for turn in turns])
+    middle, freedom = np.median(rates, axis=0), len(rates) - 1
+    of_one = np.median(((rates - middle) ** 2).sum(axis=1)) / chi2_median(3)
+    variance = of_one * np.pi / 2 * student_deviation(freedom) ** 2 / freedom
+    by_chance = chi2_tail(middle @ middle / max(variance, 1e-12), 3) > FALSE_ALARM
+    if by_chance or np.linalg.norm(middle) > LARGEST_BIAS * BIAS_STD_RAD_S:
+        return following
     x, y, z = (middle * BIAS_STD_RAD_S**2 / (BIAS_STD_RAD_S**2 + variance)).tolist()
-    return FollowingTurn((x, y, z))
+    return replace(following, bias_rad_s=(x, y, z))
 
 
 def _change_and_mean(turn: PairTurn, trajectory: Trajectory) -> tuple[Array, Array]:
@@ -227,14 +238,16 @@ def _variance(turns: Sequence[PairTurn]) -> float:
 def accepted_turn(
     runs: Sequence[Sequence[PairTurn | None]], trajectory: Trajectory
 ) -> tuple[FollowingTurn, float | None]:
-    """The fitted bias, lag and part if they meet MOST_REMAINING, else the bias alone; and :func:`_bend` of the rest."""
+    """The fitted lag and part if they meet MOST_REMAINING, else none, with a bias; and :func:`_bend` of the rest."""
     turns = [turn for run in runs for turn in run if turn is not None]
-    none, bend = biased_turn(turns), _bend(runs)
+    none, bend = with_bias(FollowingTurn(), turns, trajectory), _bend(runs)
     if bend is None:
         return none, None
     fitted = following_turn(turns, trajectory)
     left = _bend([[None if turn is None else fitted.residual_of(turn, trajectory) for turn in run] for run in runs])
-    return (fitted, left) if left is not None and left < MOST_REMAINING * bend else (none, bend)
+    if left is None or left >= MOST_REMAINING * bend:
+        return none, bend
+    return with_bias(fitted, turns, trajectory), left
 
 
 def _bend(runs: Sequence[Sequence[PairTurn | None]]) -> float | None:
