@@ -24,7 +24,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.join import median_period_s
 from virest.capture.records import Capture, Frame
 from virest.image_formation.row_clock import RowClock, row_time_s
-from virest.inference.coarse_alignment import MIN_PAIRS, axis_maps
+from virest.inference.coarse_alignment import MIN_PAIRS, SEARCH_S, axis_maps
 from virest.inference.frame_rotations import gyro_turns
 from virest.inference.frame_selection import choose_pairs
 from virest.inference.guidance import GyroGuide, gyro_guide
@@ -43,8 +43,8 @@ TILES = 3
 """Tiles along each side."""
 FLAT_LEVELS = 1.5
 """Tiles with a smaller standard deviation of grey levels are ignored."""
-STEP_S, NEAR_S, SEARCH_S = 0.008, 0.04, 1.0
-"""Step of the offsets; range around the profile's offset, searched first; full range."""
+STEP_S, NEAR_S = 0.008, 0.04
+"""Step of the offsets; range around the profile's offset, searched before that of SEARCH_S."""
 FINE_STEP_S = 0.002
 """Step of the offsets about the best one."""
 FALSE_ALARMS = 1e-3

@@ -56,8 +56,8 @@ class RestorationPlan:
     translations: Mapping[int, FrameTranslation] | None = None
     """By movie index, at the settings' reference time; None or missing: rotation only."""
     contradicted: CameraProfile | None = None
-    """The profile that the frames support, where they contradict a stated value: steps that would do harm according to
-    it are skipped; None: no contradiction."""
+    """The profile with the exposure that the frames' blur shows, where it contradicts the stated one: steps that would
+    do harm according to it are skipped; None: no contradiction."""
 
     missing_turn: MissingTurn | None = None
     """Rotation that neighbouring frames show and the prediction lacks; None: none, or not measurable."""

@@ -56,8 +56,8 @@ from virest.restoration.settings import RestorationSettings
 MIN_COARSE_EXPLAINED = 0.5
 """Least fraction of the frames' rotation that the gyroscope must explain at a coarse offset for it to be refined."""
 OFFSET_DOUBT_S, BIAS_FLOOR_RAD_S = 0.003, 1e-3
-"""Warn if a stated offset differs by this much, s, from the frames'; systematic standard deviation of a gyroscope bias,
-since tracking can cause as much."""
+"""Replace a stated offset that differs by this much, s, from the frames'; systematic standard deviation of a
+gyroscope bias, since tracking can cause as much."""
 OTHER_OFFSET = "the frames indicate a time offset of"
 UNCHECKED = "agreement of frames and gyroscope could not be tested"
 OTHER_PATHS = "the frames show blur paths"
@@ -145,7 +145,7 @@ def _planned(
             )
             if estimate.determined:
                 offset_s, std_s = estimate.time_offset_s, estimate.std_s
-            plan = _with_offset_conflict(plan, profile.time_offset_s, offset_s, std_s)
+            plan = _with_offset_conflict(plan, profile.time_offset_s, offset_s, std_s, OFFSET_SOURCE)
     if plan.refusal is not None:
         return plan
     if alignment is not None:
@@ -191,7 +191,7 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
         return plan
     source = "tracked points against gyroscope and accelerometer"
     if given.time_offset_s is not None:
-        plan = _with_offset_conflict(plan, given.time_offset_s, offset_s, std_s)
+        plan = _with_offset_conflict(plan, given.time_offset_s, offset_s, std_s, source)
     else:
         profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
         plan = replace(plan.without(NoteCode.TIME_OFFSET).without(NoteCode.NOT_FOLLOWING), profile=profile)
@@ -204,7 +204,9 @@ def _with_clock(plan: RestorationPlan, given: CameraProfile, alignment: VisualIn
     return replace(plan, profile=profile)
 
 
-def _with_offset_conflict(plan: RestorationPlan, given_s: float, offset_s: float, std_s: float) -> RestorationPlan:
+def _with_offset_conflict(
+    plan: RestorationPlan, given_s: float, offset_s: float, std_s: float, source: str
+) -> RestorationPlan:
     """Replace the profile's time offset by the frames', with a note, where they differ significantly.
 
     A wrong offset misplaces rows by the rotation rate's change over it, and an offset from tracked points holds at
@@ -216,7 +218,7 @@ def _with_offset_conflict(plan: RestorationPlan, given_s: float, offset_s: float
         f"{OTHER_OFFSET} {offset_s * 1e3:+.1f} ± {std_s * 1e3:.1f} ms, used instead of the profile's "
         f"{given_s * 1e3:+.1f} ms: calibrate"
     )
-    profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
+    profile = plan.profile.with_estimate("time_offset_s", offset_s, std_s, source, time_offset_s=offset_s)
     return replace(plan, profile=profile).noted(NoteCode.OTHER_OFFSET, text)
 
 

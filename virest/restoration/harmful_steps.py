@@ -1,7 +1,7 @@
-"""Steps that would do harm according to the frames, where these contradict a profile's clock or blur.
+"""Steps that would do harm according to the frames, where their blur contradicts the profile's exposure time.
 
-A frame has two motions: the predicted one, from the given profile, and the observed one, from the profile as the frames
-support it.  A stated value is kept, but a step that the observed motion says would do harm is skipped.
+A frame has two motions: the predicted one, with the stated exposure, and the observed one, with that which the blur
+shows.  The stated one is kept, but a step that the observed motion says would do harm is skipped.
 """
 
 from __future__ import annotations

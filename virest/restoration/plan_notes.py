@@ -18,7 +18,7 @@ class NoteCode(Enum):
     OTHER_AXES = auto()
     """The gyroscope explains the rotation with other axes than the profile's."""
     OTHER_OFFSET = auto()
-    """The frames contradict a stated offset."""
+    """The frames contradict a stated offset, and theirs is used."""
     FOCAL_LENGTH = auto()
     """The focal length, missing in the profile, could not be estimated."""
     BLUR_LENGTH = auto()

@@ -2,8 +2,9 @@
 
 Whatever is wrong with the profile (clock offset, residual stabilisation, the gyroscope's low pass, focal length), the
 picture moves otherwise than predicted, and the shift between two frames measures the mean error between them.  The part
-that is a function of the predicted rate is fitted once per capture.  The rest is interpolated linearly in time between
-the middles of the intervals; its typical size, and the error of the interpolation, are measured once per capture.
+that is constant or a function of the predicted rate is fitted once per capture.  The rest is interpolated linearly in
+time between the middles of the intervals; its typical size, and the error of the interpolation, are measured once per
+capture.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ HALF_SPACING = 0.25
 
 LAG_STD_S, PART_STD, BIAS_STD_RAD_S = 0.003, 0.1, 0.02
 """Priors: recorders stamp frames and samples to a few milliseconds; a stabiliser or low pass removes about a tenth of
-the rotation from the picture or the log; the bias of phones' gyroscopes is below 0.02 rad/s."""
-LARGEST_BIAS = 3.0
-"""Largest bias, in deviations of its prior."""
+the rotation from the picture or the log; data sheets of phones' gyroscopes state a bias of up to 1°/s, 0.02 rad/s."""
+LARGEST_BIAS_RAD_S = 3 * BIAS_STD_RAD_S
+"""A larger constant rate is no bias."""
 MOST_REMAINING = 0.5
 """Use the fitted lag and part if they reduce the interpolation error's variance below this fraction.  A stabiliser that
 cancels only slow rotation is no function of the rate, and a fit of two values always reduces the variance a little
@@ -216,7 +217,7 @@ def with_bias(following: FollowingTurn, turns: Sequence[PairTurn], trajectory: T
     of_one = np.median(((rates - middle) ** 2).sum(axis=1)) / chi2_median(3)
     variance = of_one * np.pi / 2 * student_deviation(freedom) ** 2 / freedom
     by_chance = chi2_tail(middle @ middle / max(variance, 1e-12), 3) > FALSE_ALARM
-    if by_chance or np.linalg.norm(middle) > LARGEST_BIAS * BIAS_STD_RAD_S:
+    if by_chance or np.linalg.norm(middle) > LARGEST_BIAS_RAD_S:
         return following
     x, y, z = (middle * BIAS_STD_RAD_S**2 / (BIAS_STD_RAD_S**2 + variance)).tolist()
     return replace(following, bias_rad_s=(x, y, z))
