@@ -27,6 +27,7 @@ from virest.errors import CalibrationError, OutputError
 from virest.inference.frame_selection import high_motion_frames
 from virest.inference.guide_choice import track_guided
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.tracking import Guide, TrackPair, track_frames
 from virest.report.words import residual_words
 
 EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
@@ -61,8 +62,8 @@ class CalibrationPlan:
 
     @property
     def steps(self) -> int:
-        """Number of calls of ``progress``."""
-        return len(self.frames) + FIT_STEPS
+        """Number of steps that ``progress`` counts: frames are tracked twice at most."""
+        return 2 * len(self.frames) + FIT_STEPS
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +166,11 @@ def find_calibration(
     movie = plan.capture.movie
     gray = GrayReader(movie, probe_movie(movie))
     pairs = track_guided(plan.capture, plan.profile, gray, plan.frames, each, step)
-    found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1))
+
+    def track_again(guide: Guide) -> list[TrackPair]:
+        return track_frames(gray, plan.frames, each, step, guide)
+
+    found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1), track_again)
     _require_offset(found)
     noise = measure_imu_noise(plan.capture.imu.time_s, plan.capture.imu.gyro_rad_s, plan.capture.imu.accel_m_s2)
     return as_json(plan, found, noise), found, noise

@@ -43,11 +43,12 @@ from virest.inference.blur_bias import RELATIVE_STD, blur_bias_px
 from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.coded_motion import coding_bias_px
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
+from virest.inference.even_blur import even_guide
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
-from virest.inference.tracking import TrackPair
+from virest.inference.tracking import Guide, TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
 from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
@@ -123,10 +124,12 @@ def calibrate_geometry(
     pairs: Sequence[TrackPair],
     extra: Sequence[str] = (),
     progress: Callable[[str], None] | None = None,
+    track_again: Callable[[Guide], Sequence[TrackPair]] | None = None,
 ) -> GeometryCalibration:
     """Fit time offset, readout, IMU–camera rotation, gyroscope bias and the terms in ``extra``.
 
-    extra: keys of OPTIONAL, and FRAME_LAG.  progress: called with the name of each finished stage.  Raises
+    extra: keys of OPTIONAL, and FRAME_LAG.  progress: called with the name of each finished stage.  track_again: tracks
+    the same frames with a guide; once a fit explains the points, they are tracked in equally blurred frames.  Raises
     CalibrationError if the data do not determine even the offset: a camera at rest, a steady pan, too few points,
     frames that do not follow the gyroscope.
     """
@@ -147,7 +150,7 @@ def calibrate_geometry(
     joint = _fit_jointly(capture.imu, observed, rough, names)
     drift = joint.held.get("clock-skew")
     span_s = float(np.ptp(joint.fit.seconds))
-    found = None
+    drifted = False
     if drift is not None and _may_drift(drift, span_s):
         with_skew = [*names, "clock-skew"]
         if rough.is_plain and abs(float(drift.change[0])) * span_s < SMALL_DRIFT_S:
@@ -160,9 +163,15 @@ def calibrate_geometry(
         drifting = _fit_jointly(capture.imu, observed, near, with_skew)
         skewed = _conclude(capture.imu, profile, begun, again, near, drifting)
         if abs(skewed.profile.clock_skew - profile.clock_skew) > DRIFT_SIGMA * _skew_std(skewed):
-            found, joint, names = skewed, drifting, with_skew
-            found = replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
-    found = found or _conclude(capture.imu, profile, start, coarse, rough, joint)
+            start, coarse, rough, joint, names, drifted = begun, again, near, drifting, with_skew, True
+    if track_again is not None and joint.corrected and joint.fit.scale < EXPLAINED_SCALE:
+        even = observe_tracks(capture, track_again(even_guide(capture, joint.fit, joint.table)), profile)
+        even = (even if lag is None else _at_true_times(capture, even, lag)).covered(capture.imu, start)
+        fitted = replace(rough, profile=joint.fit.profile, scene=joint.fit.scene)
+        joint = _fit_jointly(capture.imu, even, fitted, names, even_blur=True)
+    found = _conclude(capture.imu, profile, start, coarse, rough, joint)
+    if drifted:
+        found = replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
     report("joint")
     notes = (*found.notes, *held_notes(joint.held, names), *_uneven_note(found.profile, profile))
     found = replace(found, notes=notes, contradicted=tuple(name for name, value in joint.held.items() if value.wrong))
@@ -369,6 +378,7 @@ def _fit_with_translation(
 @dataclass(frozen=True, slots=True)
 class _Joint:
     fit: TrackFit
+    table: TrackTable
     observed: ObservedTracks
     """The points, without those of image regions that move independently."""
     excluded: float
@@ -383,8 +393,13 @@ def _optional(names: Sequence[str]) -> list[Term]:
     return [OPTIONAL[name] for name in names if name in OPTIONAL]
 
 
-def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names: Sequence[str]) -> _Joint:
-    """Fit all requested values to many points, without image regions that move independently and without mean bias."""
+def _fit_jointly(
+    imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names: Sequence[str], *, even_blur: bool = False
+) -> _Joint:
+    """Fit all requested values to many points, without image regions that move independently and without mean bias.
+
+    even_blur: guided pairs were tracked in equally blurred frames, and have no bias of blur.
+    """
     wanted = [terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION, terms_of.GYRO_BIAS, *_optional(names)]
     excluded = 0.0
     for _ in range(EXCLUSION_PASSES):
@@ -399,7 +414,9 @@ def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names
     if isinstance(fit.scene, InertialMotion):
         errors_px.append(path_errors_px(imu, fit.integrated, table, fit.scene))
     if corrected:  # without an accelerometer the blur due to translation is unknown
-        blur_px = blur_bias_px(fit.integrated, table, np.array([pair.guided for pair in observed.pairs]))
+        guided = np.array([pair.guided for pair in observed.pairs])
+        blur_px = blur_bias_px(fit.integrated, table, guided)
+        blur_px[even_blur & guided[table.pair]] = 0.0
         coding_px = coding_bias_px(fit.integrated, table, fit.scene)
         table = replace(table, second_px=table.second_px - blur_px - coding_px)
         errors_px.append(RELATIVE_STD * blur_px[None])
@@ -407,7 +424,7 @@ def _fit_jointly(imu: ImuSamples, observed: ObservedTracks, rough: _Rough, names
         fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene, errors_px=np.concatenate(errors_px))
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)
-    return _Joint(fit, observed, excluded, corrected, held)
+    return _Joint(fit, table, observed, excluded, corrected, held)
 
 
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────

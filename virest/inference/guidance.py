@@ -53,7 +53,7 @@ class GyroGuide:
         """
         if not np.isfinite(self.stamp_s[[first, second]]).all():
             return None
-        at_px = _nodes_px(shape, factor)
+        at_px = nodes_px(shape, factor)
         blur = self._blur(first, second, at_px[:: NODES + 1]) / factor**2
         return replace(
             map_between(lambda points_px: self._moved(second, first, points_px), shape, factor),
@@ -81,23 +81,38 @@ class GyroGuide:
 
 
 @dataclass(frozen=True, slots=True)
-class MapBetween:
-    """A map from the second picture to the first, polynomial in the position."""
+class SmoothField:
+    """Vectors over a picture, polynomial in the position."""
 
     coefficients: Array
-    """(NODES, NODES, 2) of the shift in Chebyshev polynomials of y and x, pixels."""
+    """(NODES, NODES, 2) of the vectors in Chebyshev polynomials of y and x, pixels."""
     shape: tuple[int, int]
+
+    def at(self, points_px: Array) -> Array:
+        """Vectors (n, 2) at points (n, 2)."""
+        height, width = self.shape
+        down = _basis(2 * points_px[:, 1] / (height - 1) - 1)
+        across = _basis(2 * points_px[:, 0] / (width - 1) - 1)
+        return np.stack([((down @ self.coefficients[..., c]) * across).sum(axis=1) for c in (0, 1)], axis=-1)
+
+    def at_pixels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Their x and y (h, w) at all pixels."""
+        down, across = (_pixel_basis(length) for length in self.shape)
+        x, y = (np.asarray(down @ v.astype(np.float32) @ across.T) for v in np.moveaxis(self.coefficients, -1, 0))
+        return x, y
+
+
+@dataclass(frozen=True, slots=True)
+class MapBetween(SmoothField):
+    """A map from the second picture to the first: the field of its shifts."""
+
     first_lacks: Array | None = None
     """(2, 2) covariance of the blur that the first picture lacks relative to the second, px²; None: none."""
     second_lacks: Array | None = None
 
     def first_of(self, points_px: Array) -> Array:
         """Positions in the first picture of points (n, 2) of the second."""
-        height, width = self.shape
-        down = _basis(2 * points_px[:, 1] / (height - 1) - 1)
-        across = _basis(2 * points_px[:, 0] / (width - 1) - 1)
-        shift = [((down @ self.coefficients[..., c]) * across).sum(axis=1) for c in (0, 1)]
-        return points_px + np.stack(shift, axis=-1)
+        return points_px + self.at(points_px)
 
     def second_of(self, points_px: Array) -> Array:
         """Positions in the second picture of points (n, 2) of the first: the inverse, by fixed-point iteration."""
@@ -109,16 +124,18 @@ class MapBetween:
                 break
         return found
 
-    def warped(self, first: Picture) -> Picture:
-        """The first picture warped to the second, and blurred if the second is more blurred."""
+    def mapped(self, first: Picture) -> Picture:
+        """The first picture warped to the second."""
         height, width = self.shape
-        down, across = (_pixel_basis(length) for length in self.shape)
-        values = self.coefficients.astype(np.float32)
-        grid_x, grid_y = ((down @ values[..., c]) @ across.T for c in (0, 1))
+        grid_x, grid_y = self.at_pixels()
         grid_x += np.arange(width, dtype=np.float32)
         grid_y += np.arange(height, dtype=np.float32)[:, None]
         shown = cv2.remap(first, grid_x, grid_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        return _blurred(np.asarray(shown, np.uint8), self.first_lacks)
+        return np.asarray(shown, np.uint8)
+
+    def warped(self, first: Picture) -> Picture:
+        """The first picture warped to the second, and blurred if the second is more blurred."""
+        return _blurred(self.mapped(first), self.first_lacks)
 
     def blurred(self, second: Picture) -> Picture:
         """The second picture, blurred if the first is more blurred."""
@@ -152,12 +169,18 @@ def _in_doubt(capture: Capture, profile: CameraProfile, stamp_s: Array, exposure
 
 def map_between(first_of: Callable[[Array], Array], shape: tuple[int, int], factor: int) -> MapBetween:
     """Interpolate a map of stored pixels (n, 2) to the first frame, for pictures (height, width) after reduction."""
-    at_px = _nodes_px(shape, factor)
-    shift = (first_of(at_px) - at_px).reshape(NODES, NODES, 2) / factor
-    return MapBetween(np.einsum("ki,lj,ijc->klc", _weights(), _weights(), shift), shape)
+    at_px = nodes_px(shape, factor)
+    field = interpolated((first_of(at_px) - at_px) / factor, shape)
+    return MapBetween(field.coefficients, shape)
 
 
-def _nodes_px(shape: tuple[int, int], factor: int) -> Array:
+def interpolated(vectors: Array, shape: tuple[int, int]) -> SmoothField:
+    """The field through vectors (NODES², 2) at the nodes of a picture (height, width)."""
+    at_nodes = vectors.reshape(NODES, NODES, 2)
+    return SmoothField(np.einsum("ki,lj,ijc->klc", _weights(), _weights(), at_nodes), shape)
+
+
+def nodes_px(shape: tuple[int, int], factor: int) -> Array:
     """Nodes (NODES², 2) over a reduced picture, in stored pixels, row by row."""
     height, width = shape
     x, y = (0.5 * (length - 1) * (1 + _nodes()) for length in (width, height))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from virest.capture.video import GrayReader
 from virest.errors import VirestError
 from virest.inference.guide_choice import track_guided
 from virest.inference.robust import NORMAL_MEDIAN
+from virest.inference.tracking import track_frames
 from virest.inference.tracking_bias import STILL_SHARED, STILL_SHARED_OTHER, shared_std
 from virest.report.figures import deviation_figure
 
@@ -108,8 +110,10 @@ def calibrated_rows(work: Path, seed: int) -> list[Row]:
 def calibrate_folder(folder: Path, extra: Sequence[str] = ()) -> GeometryCalibration:
     """Calibrate a capture as ``virest calibrate --with EXTRA`` does, without writing a profile."""
     plan = plan_calibration(folder, None, extra)
-    pairs = track_guided(plan.capture, plan.profile, GrayReader.of(plan.capture.movie), plan.frames)
-    return calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra)
+    gray = GrayReader.of(plan.capture.movie)
+    pairs = track_guided(plan.capture, plan.profile, gray, plan.frames)
+    again = partial(track_frames, gray, plan.frames)
+    return calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, track_again=lambda g: again(guide=g))
 
 
 def errors_of(found: GeometryCalibration, truth: CameraProfile) -> list[Row]:
