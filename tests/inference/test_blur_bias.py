@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
+from virest.camera.response import ResponseCurve
 from virest.inference.blur_bias import matched_shift_px
-from virest.inference.guidance import NODES, MapBetween, applied_blur
+from virest.inference.even_blur import BlurPath, EvenMap
+from virest.inference.guidance import NODES, MapBetween, applied_blur, interpolated
 from virest.inference.tracking import track_pairs
 
 Array = np.ndarray
 SIDE, MARGIN, PAIRS, INSTANTS = 288, 32, 30, 24
+GREY = ResponseCurve("gamma", gamma=2.2)
+STILL = np.zeros((2, 2))
 
 
 def test_even_paths_are_found_where_they_are() -> None:
@@ -76,10 +82,53 @@ def test_a_guide_that_blurs_the_sharper_picture_leaves_less_bias(seed: int) -> N
     assert others < 0.5
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_pictures_blurred_along_each_other_s_paths_have_no_bias(seed: int) -> None:
+    """Neither in proportion to the step nor to what acceleration does; without even blur both are plain to see."""
+    rng = np.random.default_rng(seed)
+    texture, shifts, steps, bends = _letters(rng), ([], []), [], []
+    for _ in range(PAIRS):
+        first, second, step = _hand(rng)
+        bend = second.mean(axis=0) - first.mean(axis=0)
+        pictures = _blurred(texture, first), _blurred(texture, second + step)
+        for found, guide in zip(shifts, (_Guide(step), _EvenGuide(step + bend, first, second)), strict=True):
+            (pair,) = track_pairs(enumerate(pictures), guide=guide)
+            found.append(pair.points_second_px - pair.points_first_px - step - bend)
+        for values, vector in ((steps, step), (bends, bend)):
+            values.append(vector)
+    before, after = (
+        _slopes(np.concatenate(found), *(np.repeat(v, [len(f) for f in found], axis=0) for v in (steps, bends)))
+        for found in shifts
+    )
+    assert before[1] < -0.05
+    assert abs(after[0]) < 0.3 * abs(before[0])
+    assert abs(after[1]) < 0.3 * abs(before[1])
+
+
+class _EvenGuide:
+    """Knows the step between two pictures and their blur paths."""
+
+    def __init__(self, step: Array, first: Array, second: Array) -> None:
+        self.step, self.paths = step, (first, second)
+
+    def seen_before(self, _first: int, _second: int, shape: tuple[int, int], _factor: int) -> EvenMap:
+        """The map between the two pictures."""
+        return EvenMap(_moved(-self.step, shape), *(_blur_path(path, shape) for path in self.paths), GREY)
+
+
+def _blur_path(path: Array, shape: tuple[int, int]) -> BlurPath:
+    speed, bend = (interpolated(np.tile(vector, (NODES**2, 1)), shape) for vector in _speed_and_bend(path))
+    return BlurPath(speed, bend, float(np.linalg.norm(path[-1] - path[0])))
+
+
+def _moved(step: Array, shape: tuple[int, int]) -> MapBetween:
+    return MapBetween(interpolated(np.tile(step, (NODES**2, 1)), shape).coefficients, shape)
+
+
 class _Guide:
     """Knows the step between two pictures and the covariances of their blur."""
 
-    def __init__(self, step: Array, first: Array, second: Array) -> None:
+    def __init__(self, step: Array, first: Array = STILL, second: Array = STILL) -> None:
         self.step, self.lacks = step, (applied_blur(second - first), applied_blur(first - second))
 
     @property
@@ -89,9 +138,7 @@ class _Guide:
 
     def seen_before(self, _first: int, _second: int, shape: tuple[int, int], _factor: int) -> MapBetween:
         """The map between the two pictures."""
-        shift = np.zeros((NODES, NODES, 2))
-        shift[0, 0] = -self.step
-        return MapBetween(shift, shape, *self.lacks)
+        return replace(_moved(-self.step, shape), first_lacks=self.lacks[0], second_lacks=self.lacks[1])
 
 
 def _slopes(error: Array, steps: Array, bends: Array) -> Array:

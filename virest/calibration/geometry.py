@@ -49,7 +49,7 @@ from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import Guide, TrackPair
-from virest.inference.tracking_bias import bias_std, remaining_std
+from virest.inference.tracking_bias import STILL_SHARED_OTHER, bias_std, remaining_std
 from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
@@ -164,7 +164,8 @@ def calibrate_geometry(
         skewed = _conclude(capture.imu, profile, begun, again, near, drifting)
         if abs(skewed.profile.clock_skew - profile.clock_skew) > DRIFT_SIGMA * _skew_std(skewed):
             start, coarse, rough, joint, names, drifted = begun, again, near, drifting, with_skew, True
-    if track_again is not None and joint.corrected and joint.fit.scale < EXPLAINED_SCALE:
+    biased = joint.blur_bias > STILL_SHARED_OTHER and joint.fit.scale < EXPLAINED_SCALE
+    if track_again is not None and biased:
         even = observe_tracks(capture, track_again(even_guide(capture, joint.fit, joint.table)), profile)
         even = (even if lag is None else _at_true_times(capture, even, lag)).covered(capture.imu, start)
         fitted = replace(rough, profile=joint.fit.profile, scene=joint.fit.scene)
@@ -385,6 +386,8 @@ class _Joint:
     """Fraction of the points excluded as moving independently."""
     corrected: bool
     """Whether the bias of blur and encoder was removed from the points."""
+    blur_bias: float
+    """The points' bias by blur, rms, as a fraction of their noise."""
     held: dict[str, HeldValue]
     """Optional values that were not fitted, by key of OPTIONAL."""
 
@@ -410,13 +413,14 @@ def _fit_jointly(
         if not newly_excluded:
             break
     corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
-    errors_px = []
+    errors_px, blur_bias = [], 0.0
     if isinstance(fit.scene, InertialMotion):
         errors_px.append(path_errors_px(imu, fit.integrated, table, fit.scene))
     if corrected:  # without an accelerometer the blur due to translation is unknown
         guided = np.array([pair.guided for pair in observed.pairs])
         blur_px = blur_bias_px(fit.integrated, table, guided)
         blur_px[even_blur & guided[table.pair]] = 0.0
+        blur_bias = float(np.sqrt(np.mean((blur_px / table.noise_px[table.pair, None]) ** 2)))
         coding_px = coding_bias_px(fit.integrated, table, fit.scene)
         table = replace(table, second_px=table.second_px - blur_px - coding_px)
         errors_px.append(RELATIVE_STD * blur_px[None])
@@ -424,7 +428,7 @@ def _fit_jointly(
         fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene, errors_px=np.concatenate(errors_px))
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)
-    return _Joint(fit, table, observed, excluded, corrected, held)
+    return _Joint(fit, table, observed, excluded, corrected, blur_bias, held)
 
 
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────
