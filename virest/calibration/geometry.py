@@ -39,7 +39,7 @@ from virest.errors import CalibrationError
 from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
-from virest.inference.blur_bias import RELATIVE_STD, blur_bias_px
+from virest.inference.blur_bias import LEFT_BY_EVEN_BLUR, RELATIVE_STD, blur_bias_px
 from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.coded_motion import coding_bias_px
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
@@ -417,13 +417,11 @@ def _fit_jointly(
     if isinstance(fit.scene, InertialMotion):
         errors_px.append(path_errors_px(imu, fit.integrated, table, fit.scene))
     if corrected:  # without an accelerometer the blur due to translation is unknown
-        guided = np.array([pair.guided for pair in observed.pairs])
-        blur_px = blur_bias_px(fit.integrated, table, guided)
-        blur_px[even_blur & guided[table.pair]] = 0.0
+        blur_px = blur_bias_px(fit.integrated, table, np.array([pair.guided for pair in observed.pairs]))
         blur_bias = float(np.sqrt(np.mean((blur_px / table.noise_px[table.pair, None]) ** 2)))
         coding_px = coding_bias_px(fit.integrated, table, fit.scene)
-        table = replace(table, second_px=table.second_px - blur_px - coding_px)
-        errors_px.append(RELATIVE_STD * blur_px[None])
+        table = replace(table, second_px=table.second_px - (0.0 if even_blur else blur_px) - coding_px)
+        errors_px.append((LEFT_BY_EVEN_BLUR if even_blur else RELATIVE_STD) * blur_px[None])
     if errors_px:
         fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene, errors_px=np.concatenate(errors_px))
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S

@@ -31,6 +31,8 @@ from virest.motion.trajectory import turned
 
 RELATIVE_STD = 0.35
 """Relative standard deviation of e, because textures differ."""
+LEFT_BY_EVEN_BLUR = 0.2
+"""The part of e, standard deviation, that :mod:`virest.inference.even_blur` leaves."""
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4
 """Samples of the frequency plane; HIGHEST in cycles per pixel: the pixel aperture suppresses higher frequencies."""
 NODES = 15

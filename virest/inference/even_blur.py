@@ -27,15 +27,16 @@ LEAST_BLUR_PX = 0.3
 """Shorter paths are not applied: they bias a match by less than 0.001 px."""
 FEWEST_SAMPLES, MOST_SAMPLES = 3, 32
 """Samples of a path: one for each pixel of its length within these limits."""
+INSTANTS = np.array([-1.0, -0.5, 0.5, 1.0])
+"""Instants of the exposure through which a path is interpolated, beside its middle."""
 WHITE_LEVEL = 255.0
 
 
 @dataclass(frozen=True, slots=True)
 class BlurPath:
-    """A frame's blur path p(u) = speed u + bend (u² − 1/3), u from -1 to 1 over the exposure."""
+    """A frame's blur path p(u) = Σ terms[k] u^(k+1), u from -1 to 1 over the exposure, apart from its mean."""
 
-    speed: SmoothField
-    bend: SmoothField
+    terms: tuple[SmoothField, ...]
     length_px: float
     """The largest in the picture."""
 
@@ -46,12 +47,15 @@ class BlurPath:
         light = cv2.LUT(picture, curve.linear_table())
         height, width = picture.shape
         places = np.arange(width, dtype=np.float32)[None], np.arange(height, dtype=np.float32)[:, None]
-        speed, bend = self.speed.at_pixels(), self.bend.at_pixels()
+        terms = [term.at_pixels() for term in self.terms]
         samples = int(np.clip(np.ceil(self.length_px) + 1, FEWEST_SAMPLES, MOST_SAMPLES))
         instants = ((2 * np.arange(samples) + 1) / samples - 1).astype(np.float32)
         total = np.zeros_like(light)
-        for u, v in zip(instants, instants**2 - np.mean(instants**2), strict=True):
-            x, y = (place - u * straight - v * bent for place, straight, bent in zip(places, speed, bend, strict=True))
+        powers = instants[:, None] ** np.arange(1, len(terms) + 1, dtype=np.float32)
+        for weights in powers - powers.mean(axis=0):
+            x, y = places
+            for weight, (across, down) in zip(weights, terms, strict=True):
+                x, y = x - weight * across, y - weight * down
             total += cv2.remap(light, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         grey = curve.encode(total / np.float32(samples))
         return np.asarray(np.rint(WHITE_LEVEL * np.clip(grey, 0.0, 1.0)), np.uint8)
@@ -104,13 +108,14 @@ class EvenGuide:
         window = int(np.argmin(np.abs(self.origin_s - gyro.stamp_s[frame])))
         table = replace(table, window=np.full(len(at_px), window), origin_s=self.origin_s)
         half_s = 0.5 * np.asarray(gyro.known.profile.shutter.true_exposure_s(table.first_exposure_s))
-        begin, end = (
-            predict(gyro.known, replace(table, second_stamp_s=table.second_stamp_s + side), self.scene).second_px
-            for side in (-half_s, half_s)
-        )
-        speed, bend = 0.5 * (end - begin) / factor, (0.5 * (end + begin) - at_px) / factor
-        length_px = 2 * float(np.linalg.norm(speed, axis=-1).max())
-        return BlurPath(interpolated(speed, shape), interpolated(bend, shape), length_px)
+        moved = np.stack([
+            predict(gyro.known, replace(table, second_stamp_s=table.second_stamp_s + u * half_s), self.scene).second_px
+            for u in INSTANTS
+        ]) - at_px  # fmt: skip
+        powers = INSTANTS[:, None] ** np.arange(1, len(INSTANTS) + 1)
+        terms = np.einsum("kj,jni->kni", np.linalg.inv(powers), moved / factor)
+        length_px = float(np.linalg.norm(np.diff(moved, axis=0), axis=-1).sum(axis=0).max()) / factor
+        return BlurPath(tuple(interpolated(term, shape) for term in terms), length_px)
 
 
 def even_guide(capture: Capture, fit: TrackFit, table: TrackTable) -> EvenGuide:
