@@ -117,8 +117,8 @@ class _EvenGuide:
 
 
 def _blur_path(path: Array, shape: tuple[int, int]) -> BlurPath:
-    speed, bend = (interpolated(np.tile(vector, (NODES**2, 1)), shape) for vector in _speed_and_bend(path))
-    return BlurPath(speed, bend, float(np.linalg.norm(path[-1] - path[0])))
+    terms = (interpolated(np.tile(vector, (NODES**2, 1)), shape) for vector in _speed_and_bend(path))
+    return BlurPath(tuple(terms), float(np.linalg.norm(path[-1] - path[0])))
 
 
 def _moved(step: Array, shape: tuple[int, int]) -> MapBetween:

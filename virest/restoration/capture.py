@@ -62,6 +62,9 @@ class RestorationPlan:
     missing_turn: MissingTurn | None = None
     """Rotation that neighbouring frames show and the prediction lacks; None: none, or not measurable."""
 
+    undetected_rad_s: float | None = None
+    """Standard deviation, per axis, of a missing rotation rate that the frames do not show; None: not measurable."""
+
     mask: UnsharpMask | None = None
     """The phone's sharpening, undone before deblurring; None: none detected."""
 
@@ -187,6 +190,7 @@ def restore_frames(
             pictures,
             unmasked,
             here.coding_step,
+            plan.undetected_rad_s,
         )
 
 

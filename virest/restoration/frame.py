@@ -29,7 +29,7 @@ from virest.restoration.encoding import encode_picture
 from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_harms, straightening_harms
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, static_part
-from virest.restoration.neighbours.refinement import RefinedMotion
+from virest.restoration.neighbours.refinement import RefinedMotion, unrefined_path_std_px
 from virest.restoration.parameters import (
     Deblurring,
     DegradationParameters,
@@ -104,6 +104,7 @@ def restore_frame(
     neighbours: NeighbourFinder | None = None,
     unmasked: NDArray[np.uint8] | None = None,
     coding_step: float | None = None,
+    undetected_rad_s: float | None = None,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten with one warp; steps that would not help are skipped, with a warning.
 
@@ -112,6 +113,7 @@ def restore_frame(
     frames; replaces ``motion``.  confirmed: how much of the predicted gain neighbours confirm.  neighbours: selects the
     frames for joint restoration and registers them.  unmasked: the picture with the phone's sharpening undone, to be
     deblurred; None: ``picture`` itself.  coding_step: the coder's quantiser step, grey levels; None: unknown.
+    undetected_rad_s: standard deviation of the rotation rate of a motion that neighbours did not refine; None: unknown.
     """
     clock = _Clock()
     if refined is not None:
@@ -134,7 +136,10 @@ def restore_frame(
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
         position_std_px = refined.position_std_px() if refined is not None and straighten else 0.0
-        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, position_std_px, light, coding_step)
+        path_std_px: float | None = float(np.sqrt(np.trace(covariance_px2) / 2))
+        if refined is None:
+            path_std_px = None if undetected_rad_s is None else unrefined_path_std_px(motion, undetected_rad_s)
+        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, path_std_px, position_std_px, light, coding_step)
         restored, deblurring, why_not = _deblurred(picture, blur, settings, confirmed, neighbours, unmasked)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _without_flicker(picture, curve, light)
@@ -253,7 +258,9 @@ class _KnownBlur:
     longest_px: float
     """Length of the longest blur path, defocus included."""
     covariance_px2: Array
-    """(2, 2) covariance of the blur path."""
+    """(2, 2) covariance of the blur path that the restoration counts as noise."""
+    path_std_px: float | None
+    """Standard deviation of the blur path, per axis; None: unknown."""
     position_std_px: float
     """Standard deviation of the rows' positions after straightening, per axis."""
     light: FrameLight | None
@@ -393,7 +400,7 @@ def _details(
         expected_gain_db=gain_db[0] if gain_db else None,
         expected_gain_std_db=gain_db[1] if gain_db else None,
         promised_gain_db=model.joint_gain_db(joined.passed) if joined.pictures else model.expected_gain_db,
-        path_std_px=float(np.sqrt(np.trace(blur.covariance_px2) / 2)),
+        path_std_px=blur.path_std_px,
         neighbours=tuple(JoinedNeighbour(one.number, one.weight) for one in joined.registrations),
         neighbours_gain_db=10 * float(np.log10(alone / ideal)) if joined.pictures else 0.0,
         share=measured.share,

@@ -48,7 +48,8 @@ def with_neighbour_survey(
         sights[number] = Sight(frames[number], luma, motion, why, coding_step=steps.get(number))
     plan, sights = _without_sharpening(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
-    missing = survey_turns(runs, sights, neighbours, trajectory)
+    missing, undetected_rad_s = survey_turns(runs, sights, neighbours, trajectory)
+    plan = replace(plan, undetected_rad_s=undetected_rad_s)
     if missing is not None:
         note = (
             f"neighbouring frames rotate by {missing.rate_rad_s:.3f} rad/s rms more or less than predicted: "

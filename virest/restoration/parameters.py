@@ -98,8 +98,8 @@ class Deblurring:
     expected_gain_std_db: float | None
     promised_gain_db: float
     """Gain of an ideal filter at the measured noise."""
-    path_std_px: float
-    """Standard deviation of the blur path, per axis."""
+    path_std_px: float | None
+    """Standard deviation of the blur path, per axis; None: no neighbours show it."""
     neighbours: tuple[JoinedNeighbour, ...]
     neighbours_gain_db: float
     """Part of an ideal filter's gain that the neighbours add."""

@@ -16,6 +16,7 @@ from virest.restoration.neighbours.refinement import (
     accepted_turn,
     following_turn,
     missing_turn,
+    undetected_rad_s,
     with_bias,
 )
 from virest.restoration.neighbours.registration import PairTurn
@@ -145,3 +146,27 @@ def test_rows_lie_off_by_what_is_unknown_of_the_speed() -> None:
     off_px = speed_px_s * (middles_s - motion.reference_s)
     assert refined.position_std_px() == pytest.approx(np.sqrt(np.mean(off_px**2)), rel=1e-3)
     assert RefinedMotion(motion, np.zeros((3, 3)), 0.0).position_std_px() == 0.0
+
+
+@pytest.mark.parametrize("missing_rad_s", [0.0, 0.001, 0.003])
+def test_what_pairs_do_not_exclude_holds_what_is_missing(rng: np.random.Generator, missing_rad_s: float) -> None:
+    """Two deviations hold what is missing 19 times of 20, and the deviation falls with the number of pairs."""
+    noise = 0.005
+    few, many = (
+        np.array([undetected_rad_s([_scattered(pairs, missing_rad_s, noise, rng)]) for _ in range(200)])
+        for pairs in (4, 40)
+    )
+    assert np.mean(2 * few >= missing_rad_s) >= 0.95
+    assert np.mean(2 * many >= missing_rad_s) >= 0.95
+    assert np.median(many) < 2 * max(missing_rad_s, 0.5 * noise)
+    assert np.median(many) < np.median(few)
+    assert np.all(few > 0)
+    assert undetected_rad_s([_scattered(1, 0.0, noise, rng), [None]]) is None
+
+
+def _scattered(pairs: int, missing_rad_s: float, noise: float, rng: np.random.Generator) -> list[PairTurn]:
+    """Pairs that lack independent rates."""
+    rates = rng.normal(0, np.hypot(noise, missing_rad_s), (pairs, 3))
+    return [
+        PairTurn(k * PERIOD_S, (k + 1) * PERIOD_S, rate, noise**2 * np.eye(3), 1.0, 12) for k, rate in enumerate(rates)
+    ]

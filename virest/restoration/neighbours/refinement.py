@@ -144,9 +144,7 @@ class RefinedMotion:
 
     def path_covariance_px2(self) -> Array:
         """(2, 2) covariance of the blur path's end relative to its start, at the picture's centre, x then y."""
-        profile = self.motion.profile
-        centre = np.array([[(profile.width - 1) / 2, (profile.height - 1) / 2]])
-        jacobian = turn_jacobian_px(self.motion, centre)[0]
+        jacobian = _per_turn_px(self.motion)
         spread = jacobian @ self.rate_covariance @ jacobian.T + self.scatter_px_s**2 * np.eye(2)
         return np.asarray(spread * self.motion.exposure_s**2)
 
@@ -192,6 +190,25 @@ def missing_turn(
     )
     longest = max(_harm_px(motion, found.rate_rad_s) for motion in motions)
     return found if longest > NEGLIGIBLE_PX else None
+
+
+def undetected_rad_s(runs: Sequence[Sequence[PairTurn | None]]) -> float | None:
+    """Standard deviation, per axis, of a missing rate that runs of pairs do not exclude; None with fewer than 2 pairs.
+
+    The variance found and its standard error, which is √(2 / 3n) of a single pair's variance for rates of 3 axes.
+    """
+    turns = [turn for run in runs for turn in run if turn is not None]
+    if len(turns) < 2:
+        return None
+    noise = float(np.mean([np.trace(turn.covariance) / 3 for turn in turns]))
+    found = max(_variance(turns), 0.0)
+    return float(np.sqrt(found + (found + noise) * np.sqrt(2 / (3 * len(turns)))))
+
+
+def unrefined_path_std_px(motion: RowMotion, rate_std_rad_s: float) -> float:
+    """Standard deviation of a frame's blur path, per axis, at the picture's centre, for that of the rotation rate."""
+    jacobian = _per_turn_px(motion)
+    return float(rate_std_rad_s * motion.exposure_s * np.sqrt(np.trace(jacobian @ jacobian.T) / 2))
 
 
 def following_turn(turns: Sequence[PairTurn], trajectory: Trajectory) -> FollowingTurn:
@@ -267,11 +284,15 @@ def _harm_px(motion: RowMotion, rate_rad_s: float) -> float:
 
     The latter is 0 where the readout is unknown, so that rows stay where they are.
     """
-    profile = motion.profile
-    centre = np.array([[(profile.width - 1) / 2, (profile.height - 1) / 2]])
-    speed_px_s = float(np.abs(turn_jacobian_px(motion, centre)[0]).max() * rate_rad_s)
-    apart_s = _rms_from_reference_s(motion) if profile.readout_known else 0.0
+    speed_px_s = float(np.abs(_per_turn_px(motion)).max() * rate_rad_s)
+    apart_s = _rms_from_reference_s(motion) if motion.profile.readout_known else 0.0
     return speed_px_s * max(motion.exposure_s, float(np.sqrt(12)) * apart_s)
+
+
+def _per_turn_px(motion: RowMotion) -> Array:
+    """(2, 3) px per rad: shift of the picture's centre by a rotation."""
+    centre = np.array([[(motion.profile.width - 1) / 2, (motion.profile.height - 1) / 2]])
+    return np.asarray(turn_jacobian_px(motion, centre)[0])
 
 
 def _rms_from_reference_s(motion: RowMotion) -> float:

@@ -15,7 +15,7 @@ from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.confirmation import ConfirmedGain, confirmed_gain
-from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion, missing_turn
+from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion, missing_turn, undetected_rad_s
 from virest.restoration.neighbours.registration import judged_change
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 
@@ -60,14 +60,17 @@ def store_lumas(
 
 def survey_turns(
     runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], neighbours: FrameNeighbours, trajectory: Trajectory
-) -> MissingTurn | None:
-    """The rotation that the prediction lacks, from runs of frames; None: not significant, or not measurable."""
+) -> tuple[MissingTurn | None, float | None]:
+    """The rotation that the prediction lacks, from runs of frames; None: not significant, or not measurable.
+
+    And the standard deviation, rad/s, of the rate that it may lack without that; None: not measurable.
+    """
     motions: list[RowMotion] = [s.motion for s in sights.values() if s.usable and s.motion is not None]
     turns = [
         [neighbours.turn(sights[a], sights[b]) if a in sights and b in sights else None for a, b in pairwise(run)]
         for run in runs
     ]
-    return missing_turn(turns, motions, trajectory)
+    return missing_turn(turns, motions, trajectory), undetected_rad_s(turns)
 
 
 def survey_gain(
