@@ -49,7 +49,7 @@ from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import Guide, TrackPair
-from virest.inference.tracking_bias import STILL_SHARED_OTHER, bias_std, remaining_std
+from virest.inference.tracking_bias import EVEN_SHARED, bias_std, remaining_std
 from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
@@ -164,8 +164,7 @@ def calibrate_geometry(
         skewed = _conclude(capture.imu, profile, begun, again, near, drifting)
         if abs(skewed.profile.clock_skew - profile.clock_skew) > DRIFT_SIGMA * _skew_std(skewed):
             start, coarse, rough, joint, names, drifted = begun, again, near, drifting, with_skew, True
-    biased = joint.blur_bias > STILL_SHARED_OTHER and joint.fit.scale < EXPLAINED_SCALE
-    if track_again is not None and biased:
+    if track_again is not None and joint.corrected and not joint.even and joint.fit.scale < EXPLAINED_SCALE:
         even = observe_tracks(capture, track_again(even_guide(capture, joint.fit, joint.table)), profile)
         even = (even if lag is None else _at_true_times(capture, even, lag)).covered(capture.imu, start)
         fitted = replace(rough, profile=joint.fit.profile, scene=joint.fit.scene)
@@ -386,8 +385,8 @@ class _Joint:
     """Fraction of the points excluded as moving independently."""
     corrected: bool
     """Whether the bias of blur and encoder was removed from the points."""
-    blur_bias: float
-    """The points' bias by blur, rms, as a fraction of their noise."""
+    even: bool
+    """Whether frames are equally blurred: tracked so, or with blur that biases no point by EVEN_SHARED of its noise."""
     held: dict[str, HeldValue]
     """Optional values that were not fitted, by key of OPTIONAL."""
 
@@ -413,12 +412,12 @@ def _fit_jointly(
         if not newly_excluded:
             break
     corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
-    errors_px, blur_bias = [], 0.0
+    errors_px, even = [], even_blur
     if isinstance(fit.scene, InertialMotion):
         errors_px.append(path_errors_px(imu, fit.integrated, table, fit.scene))
     if corrected:  # without an accelerometer the blur due to translation is unknown
         blur_px = blur_bias_px(fit.integrated, table, np.array([pair.guided for pair in observed.pairs]))
-        blur_bias = float(np.sqrt(np.mean((blur_px / table.noise_px[table.pair, None]) ** 2)))
+        even |= bool(np.sqrt(np.mean((blur_px / table.noise_px[table.pair, None]) ** 2)) < EVEN_SHARED)
         coding_px = coding_bias_px(fit.integrated, table, fit.scene)
         table = replace(table, second_px=table.second_px - (0.0 if even_blur else blur_px) - coding_px)
         errors_px.append((LEFT_BY_EVEN_BLUR if even_blur else RELATIVE_STD) * blur_px[None])
@@ -426,7 +425,7 @@ def _fit_jointly(
         fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene, errors_px=np.concatenate(errors_px))
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)
-    return _Joint(fit, table, observed, excluded, corrected, blur_bias, held)
+    return _Joint(fit, table, observed, excluded, corrected, even, held)
 
 
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -438,7 +437,7 @@ def _conclude(
     """Assess and assemble the result."""
     fit, observed = joint.fit, joint.observed
     noise = float(np.median(observed.noise_px))
-    if joint.corrected:
+    if joint.even:
         gyro_rad_s = _gyro_mean_std_rad_s(imu, float(np.ptp(fit.seconds)))
         bias = {term.name: remaining_std(fit, term.name, gyro_rad_s) for term in fit.terms}
     else:

@@ -1,7 +1,7 @@
 """Systematic tracking errors that are the same throughout a capture, so that its own statistics do not reveal them.
 
-:func:`bias_std` applies to points as tracked, :func:`remaining_std` to points corrected by
-:mod:`virest.inference.blur_bias`.
+:func:`bias_std` applies to points as tracked, :func:`remaining_std` to points tracked in equally blurred frames
+(:mod:`virest.inference.even_blur`).
 
 Tracked steps are slightly late and short where blur changes from frame to frame, and more so where the codec's
 predicted blocks replace image detail.  The error was measured on simulated captures with H.264 at 0.12 to 2 bits per
@@ -74,20 +74,18 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
     return np.asarray(floor)
 
 
-# ── points without the bias of their blur ────────────────────────────────────────────────────────────────────────
+# ── points from equally blurred frames, without the encoder's mean bias ──────────────────────────────────────────
 
-STILL_SHARED = {"readout_time": 0.014, "focal_length": 0.026, "principal_point": 0.014}
-STILL_SHARED_OTHER = 0.008
-"""Fraction of a step's noise that is correlated with a value's own pattern after the mean bias of blur and encoder is
-removed: for three values, and for any other.  The most likely fractions in 81 captures, a quarter each of them quiet,
-fast, coded at about 0.1 bits per pixel, and drawn like those of ``python -m virest.app.bench --only
-calibration``; that command prints the values for its captures."""
+EVEN_SHARED = 0.004
+"""Fraction of a step's noise that is correlated with a value's own pattern, the most likely one for all values in 48
+captures drawn like those of ``python -m virest.app.bench --only calibration`` (0 to 0.0065 are within two standard
+deviations of it); that command prints the fraction that its captures imply for each value."""
 GYRO_WANDER_RAD_S = 5e-5
 """Bias instability of phones' gyroscopes: 10 degrees an hour (data sheets of BMI160, LSM6DSO, ICM-20602: 3 to 10)."""
 
 
 def remaining_std(fit: TrackFit, name: str, gyro_mean_std_rad_s: float) -> Array:
-    """Standard deviation (k,) of a term's remaining bias, from points without the mean bias of blur and encoder.
+    """Standard deviation (k,) of a term's remaining bias, from equally blurred frames without the encoder's mean bias.
 
     gyro_mean_std_rad_s: standard deviation of the mean gyroscope noise over the capture.
     """
@@ -100,6 +98,5 @@ def remaining_std(fit: TrackFit, name: str, gyro_mean_std_rad_s: float) -> Array
 
 
 def shared_std(fit: TrackFit, name: str) -> Array:
-    """The part (k,) of :func:`remaining_std` that comes from STILL_SHARED."""
-    per_point = np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[fit.slices[name]])
-    return np.asarray(STILL_SHARED.get(name, STILL_SHARED_OTHER) * per_point)
+    """The part (k,) of :func:`remaining_std` that comes from EVEN_SHARED."""
+    return np.asarray(EVEN_SHARED * np.sqrt(2 * fit.weight.sum() * np.diag(fit.curvature)[fit.slices[name]]))

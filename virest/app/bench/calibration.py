@@ -6,7 +6,7 @@ lens, orientation.  Seeds below FIRST_SEED are reserved for choosing constants.
 For each value the table shows median |error| / deviation (0.67 where deviations hold), the fraction of errors within
 two deviations (0.95), the mean error in deviations, which a bias moves from 0, and a histogram.  "share" is the
 fraction of a step's noise that is correlated with the value's own pattern: the one that these errors imply (with it
-the median would be 0.67) and the one that :data:`virest.inference.tracking_bias.STILL_SHARED` uses.
+the median would be 0.67) and the one that :data:`virest.inference.tracking_bias.EVEN_SHARED` uses.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from virest.errors import VirestError
 from virest.inference.guide_choice import track_guided
 from virest.inference.robust import NORMAL_MEDIAN
 from virest.inference.tracking import track_frames
-from virest.inference.tracking_bias import STILL_SHARED, STILL_SHARED_OTHER, shared_std
+from virest.inference.tracking_bias import EVEN_SHARED, shared_std
 from virest.report.figures import deviation_figure
 
 Row = dict[str, Any]
@@ -175,15 +175,13 @@ def _error(value: CalibratedValue, found: CameraProfile, truth: CameraProfile) -
 def summed(rows: Sequence[Row]) -> dict[str, Any]:
     """Statistics of one value's errors in standard deviations, and the shared fraction of the noise that they imply."""
     errors = np.array([row["error_in_std"] for row in rows])
-    name = _TERMS[rows[0]["value"]][0]
-    in_use = STILL_SHARED.get(name, STILL_SHARED_OTHER)
     return {
         "count": len(errors),
         "median": float(np.median(np.abs(errors))),
         "within_two": float(np.mean(np.abs(errors) < 2)),
         "mean": float(errors.mean()),
-        "share_asked": in_use * _implied_factor(rows),
-        "share_in_use": in_use,
+        "share_asked": EVEN_SHARED * _implied_factor(rows),
+        "share_in_use": EVEN_SHARED,
         "histogram": np.histogram(errors, BINS)[0].tolist(),
     }
 
