@@ -26,9 +26,10 @@ FALSE_ALARM = 1e-3
 NEGLIGIBLE_PX = 0.05
 """Path error below which nothing is corrected: it spoils 0.2 % of the power at 0.5 cycles per pixel (|2πf δ|² / 12),
 less than any movie's noise.  Rows misplaced by δ rms spoil as much as a path that is √12 δ too long."""
-FARTHEST = 5.0
-"""Reject a pair whose missing rate exceeds this many standard deviations: it shows something else, such as a passing
-bus."""
+FARTHEST, MOST_SCATTERED = 5.0, 1.8
+"""Reject a pair whose missing rate exceeds this many standard deviations and whose tiles scatter by this many times the
+usual: it shows something else, such as a passing bus.  By chance 16 tiles scatter that much in 1 of 1000 pairs (F
+distribution); tiles that agree on a large rate show the camera."""
 HALF_SPACING = 0.25
 """Error of linear interpolation over that at twice the spacing: it is proportional to the spacing squared."""
 
@@ -103,7 +104,7 @@ class MissingTurn:
         ]
         if not any(chains):
             return RefinedMotion(motion, prior, self.scatter_px_s)
-        known = [_shrunk(turn, prior) for turn in (*reversed(chains[0]), *chains[1])]
+        known = [_shrunk(turn, self.rest_rad_s) for turn in (*reversed(chains[0]), *chains[1])]
         times_s, rates, covariances = (np.array(parts) for parts in zip(*known, strict=True))
         if all(chains):
             first, last = len(chains[0]) - 1, len(chains[0])
@@ -126,6 +127,8 @@ class MissingTurn:
         return [turn for turn in known[: known.index(None) if None in known else None] if turn is not None]
 
     def _is_inlier(self, turn: PairTurn) -> bool:
+        if turn.scatter_px_s < MOST_SCATTERED * self.scatter_px_s:
+            return True
         spread = turn.covariance + self.rest_rad_s**2 * np.eye(3)
         return float(turn.rate_rad_s @ np.linalg.solve(spread, turn.rate_rad_s)) < FARTHEST**2
 
@@ -302,7 +305,9 @@ def _rms_from_reference_s(motion: RowMotion) -> float:
     return float(np.sqrt((first**2 + first * last + last**2) / 3))
 
 
-def _shrunk(turn: PairTurn, prior: Array) -> tuple[float, Array, Array]:
-    """(middle of the interval, rate, covariance) after applying the prior covariance of missing rates."""
+def _shrunk(turn: PairTurn, rest_rad_s: float) -> tuple[float, Array, Array]:
+    """(middle of the interval, rate, covariance) after applying a prior: the usual missing rate, or this larger one."""
+    own = max(float(turn.rate_rad_s @ turn.rate_rad_s - np.trace(turn.covariance)) / 3, 0.0)
+    prior = max(rest_rad_s**2, own) * np.eye(3)
     gain = prior @ np.linalg.inv(prior + turn.covariance)
     return 0.5 * (turn.start_s + turn.end_s), gain @ turn.rate_rad_s, gain @ turn.covariance
