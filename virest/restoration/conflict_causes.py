@@ -26,8 +26,9 @@ GYRO_REACH, GYRO_STEPS = 0.14, 8
 """Gyroscope scales tried: the range of the logarithm, that of plausible errors, and their number."""
 MOST_STABILISED = 0.95
 """No lens cancels more of the shake than this: such frames were cropped and rotated by software."""
-CUTOFF_HZ = (0.03, 15.0)
-"""Plausible cutoffs of an optical stabiliser."""
+HIGHEST_CUTOFF_HZ = 15.0
+"""Highest plausible cutoff of an optical stabiliser.  There is no lowest: within a second, one that follows the camera in
+10 s acts like one that never does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +109,7 @@ def _with_gyro_scale(profile: CameraProfile, found: CameraProfile, std: Array) -
 
 def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
     ext = found.extensions
-    return (
-        0 < ext.stabilisation_fraction < MOST_STABILISED and CUTOFF_HZ[0] < ext.stabilisation_cutoff_hz < CUTOFF_HZ[1]
-    )
+    return 0 < ext.stabilisation_fraction < MOST_STABILISED and ext.stabilisation_cutoff_hz < HIGHEST_CUTOFF_HZ
 
 
 FOCAL_LENGTH, GYROSCOPE = "focal length", "gyroscope scale"
