@@ -43,13 +43,13 @@ from virest.inference.blur_bias import LEFT_BY_EVEN_BLUR, RELATIVE_STD, blur_bia
 from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.coded_motion import coding_bias_px
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
-from virest.inference.even_blur import even_guide
+from virest.inference.even_blur import even_guide, is_blurred
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import Guide, TrackPair
-from virest.inference.tracking_bias import EVEN_SHARED, bias_std, remaining_std
+from virest.inference.tracking_bias import bias_std, remaining_std
 from virest.inference.visual_inertial import START_INVERSE_DEPTH_PER_M
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
@@ -164,7 +164,8 @@ def calibrate_geometry(
         skewed = _conclude(capture.imu, profile, begun, again, near, drifting)
         if abs(skewed.profile.clock_skew - profile.clock_skew) > DRIFT_SIGMA * _skew_std(skewed):
             start, coarse, rough, joint, names, drifted = begun, again, near, drifting, with_skew, True
-    if track_again is not None and joint.corrected and not joint.even and joint.fit.scale < EXPLAINED_SCALE:
+    explained = joint.corrected and joint.fit.scale < EXPLAINED_SCALE
+    if track_again is not None and explained and is_blurred(joint.fit, joint.table):
         even = observe_tracks(capture, track_again(even_guide(capture, joint.fit, joint.table)), profile)
         even = (even if lag is None else _at_true_times(capture, even, lag)).covered(capture.imu, start)
         fitted = replace(rough, profile=joint.fit.profile, scene=joint.fit.scene)
@@ -386,7 +387,7 @@ class _Joint:
     corrected: bool
     """Whether the bias of blur and encoder was removed from the points."""
     even: bool
-    """Whether frames are equally blurred: tracked so, or with blur that biases no point by EVEN_SHARED of its noise."""
+    """Whether the points were tracked in equally blurred frames."""
     held: dict[str, HeldValue]
     """Optional values that were not fitted, by key of OPTIONAL."""
 
@@ -412,12 +413,11 @@ def _fit_jointly(
         if not newly_excluded:
             break
     corrected = bool(np.any(table.first_exposure_s)) and not isinstance(fit.scene, DirectedMotion)
-    errors_px, even = [], even_blur
+    errors_px = []
     if isinstance(fit.scene, InertialMotion):
         errors_px.append(path_errors_px(imu, fit.integrated, table, fit.scene))
     if corrected:  # without an accelerometer the blur due to translation is unknown
         blur_px = blur_bias_px(fit.integrated, table, np.array([pair.guided for pair in observed.pairs]))
-        even |= bool(np.sqrt(np.mean((blur_px / table.noise_px[table.pair, None]) ** 2)) < EVEN_SHARED)
         coding_px = coding_bias_px(fit.integrated, table, fit.scene)
         table = replace(table, second_px=table.second_px - (0.0 if even_blur else blur_px) - coding_px)
         errors_px.append((LEFT_BY_EVEN_BLUR if even_blur else RELATIVE_STD) * blur_px[None])
@@ -425,7 +425,7 @@ def _fit_jointly(
         fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene, errors_px=np.concatenate(errors_px))
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)
-    return _Joint(fit, table, observed, excluded, corrected, even, held)
+    return _Joint(fit, table, observed, excluded, corrected, even_blur, held)
 
 
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────

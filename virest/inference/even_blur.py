@@ -20,7 +20,7 @@ from virest.image_formation.point_model import TrackTable, predict
 from virest.inference.guidance import GyroGuide, MapBetween, SmoothField, gyro_guide, interpolated, nodes_px
 from virest.inference.observed_tracks import track_table
 from virest.inference.track_fit import TrackFit
-from virest.inference.tracking import TrackPair
+from virest.inference.tracking import TrackPair, shrink_factor
 from virest.motion.scene_motion import InertialMotion
 
 LEAST_BLUR_PX = 0.3
@@ -116,6 +116,15 @@ class EvenGuide:
         terms = np.einsum("kj,jni->kni", np.linalg.inv(powers), moved / factor)
         length_px = float(np.linalg.norm(np.diff(moved, axis=0), axis=-1).sum(axis=0).max()) / factor
         return BlurPath(tuple(interpolated(term, shape) for term in terms), length_px)
+
+
+def is_blurred(fit: TrackFit, table: TrackTable) -> bool:
+    """Whether half of the points have blur paths long enough to be applied."""
+    profile, rate_rad_s = fit.profile, np.linalg.norm(fit.integrated.trajectory.rate_rad_s(fit.seconds), axis=-1)
+    if profile.intrinsics is None:
+        return False
+    path_px = profile.intrinsics.fx_px * rate_rad_s * profile.shutter.true_exposure_s(table.second_exposure_s)
+    return bool(np.median(path_px) > LEAST_BLUR_PX * shrink_factor(profile.width, profile.height))
 
 
 def even_guide(capture: Capture, fit: TrackFit, table: TrackTable) -> EvenGuide:
