@@ -32,9 +32,8 @@ from virest.motion.trajectory import turned
 RELATIVE_STD = 0.35
 """Relative standard deviation of e, because textures differ."""
 LEFT_BY_EVEN_BLUR = 0.2
-"""The part of e, standard deviation, that :mod:`virest.inference.even_blur` leaves: the most likely in 48 captures drawn
-like those of ``python -m virest.app.bench --only calibration``; half of it is 7 times less likely, 1.5 times it 3 times.
-"""
+"""Standard deviation of the part of e that :mod:`virest.inference.even_blur` leaves: the most likely in 48 captures
+drawn like those of ``python -m virest.app.bench --only calibration``; half of it is 7 times less likely."""
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4
 """Samples of the frequency plane; HIGHEST in cycles per pixel: the pixel aperture suppresses higher frequencies."""
 NODES = 15
