@@ -16,6 +16,7 @@ from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
+from virest.inference.chance import student_tail
 from virest.inference.coarse_alignment import MIN_EXPLAINED, MIN_MOTION_PX, MIN_PAIRS, SEARCH_S, STEP_S, align_coarsely
 from virest.inference.frame_rotations import FrameRotations, gyro_turns
 from virest.inference.observed_tracks import MIN_TRACKS, ObservedTracks
@@ -43,8 +44,9 @@ MAX_FOCAL_RESIDUAL = 1.5
 point 9 px off leaves 1.15 to 1.4, with focal errors below 0.1 % (tracks from three analytic motions)."""
 MAX_FOCAL_SPREAD = 0.25
 """Largest relative standard deviation of a focal length that is reported."""
-DRIFT_SIGMA, LEAST_DRIFT = 4.0, 5e-4
-"""A drift is noted above both: this many standard deviations (false-alarm probability 6e-5) and seconds per second."""
+DRIFT_P, LEAST_DRIFT = 6e-5, 5e-4
+"""A drift is noted if it is larger, s per s, and chance makes one as significant with a smaller probability: Student's
+distribution with the time blocks that inform it, of which half a second has few."""
 NEAR_S = 0.01
 """What the gyroscope explains at a fitted offset is read within this of it: 2.5 steps of the search."""
 FOREIGN_BIAS = 4.0
@@ -201,7 +203,8 @@ def _concluded(
     if not observed.exposure_known:
         variance += UNKNOWN_EXPOSURE_STD_S**2
         notes.append("exposure unknown: the offset includes half of it")
-    if abs(drift) > max(DRIFT_SIGMA * drift_std, LEAST_DRIFT):
+    freedom = max(float(fit.stretches[fit.slices["clock_skew"]][0]) - 1, 1.0)
+    if abs(drift) > LEAST_DRIFT and 2 * student_tail(abs(drift) / drift_std, freedom) < DRIFT_P:
         variance += (drift * np.hypot(middle_s, spread_s)) ** 2
         notes.append(f"the offset drifts by {1e3 * drift:.2f} ms per second: the clocks run at different rates")
     bias_std_rad_s = std("gyro_bias")
