@@ -27,8 +27,8 @@ GYRO_REACH, GYRO_STEPS = 0.14, 8
 MOST_STABILISED = 0.95
 """No lens cancels more of the shake than this: such frames were cropped and rotated by software."""
 HIGHEST_CUTOFF_HZ = 15.0
-"""Highest plausible cutoff of an optical stabiliser.  There is no lowest: within a second, one that follows the camera in
-10 s acts like one that never does."""
+"""Highest plausible cutoff of an optical stabiliser.  There is no lowest: within a second, one that follows the camera
+in 10 s acts like one that never does."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.refinement import (
     NEGLIGIBLE_PX,
     FollowingTurn,
+    MissingTurn,
     RefinedMotion,
     accepted_turn,
     following_turn,
@@ -110,6 +111,24 @@ def test_a_passing_bus_does_not_move_the_bias(rng: np.random.Generator) -> None:
         for k, turn in enumerate(_biased(_turns(0.0, 0.0, 0.002, rng)))
     ]
     assert with_bias(FollowingTurn(), turns, _Waving()).bias_rad_s == pytest.approx(BIAS_RAD_S, abs=0.004)
+
+
+@pytest.mark.parametrize(("scatter", "believed"), [(1.2, True), (4.0, False)])
+def test_a_large_turn_is_the_camera_s_if_the_tiles_agree_on_it(scatter: float, *, believed: bool) -> None:
+    """It is then added whole; if the tiles scatter, something else moves, and the frame is as uncertain as any."""
+    camera, usual = TurningCamera(phone(), exposure_s=0.02), 0.005
+    missing = MissingTurn(usual, usual, 0.0, 1.0, 12)
+    rate = np.array([0.08, -0.05, 0.02])
+    middle_s = camera.motion.middle_s
+    turns = [
+        PairTurn(middle_s + at * PERIOD_S, middle_s + (at + 1) * PERIOD_S, rate, 0.004**2 * np.eye(3), scatter, 16)
+        for at in (-1, 0)
+    ]
+    found = missing.refined(camera.motion, turns[:1], turns[1:], camera.trajectory)
+    assert (found.further is not None) == believed
+    if found.further is not None:
+        assert found.further.rate_rad_s.mean(axis=0) == pytest.approx(rate, rel=0.05)
+        assert np.sqrt(np.trace(found.rate_covariance) / 3) < 0.005
 
 
 @pytest.mark.parametrize("count", [3, 12])
