@@ -73,6 +73,16 @@ def test_a_stabiliser_that_no_profile_names_is_found(fraction: float) -> None:
     assert set(found.profile.estimates) == {"stabilisation_fraction", "stabilisation_cutoff_hz"}
 
 
+@pytest.mark.parametrize("seed", [71, 73, 75])
+def test_a_stabiliser_that_never_lets_go_is_found(seed: int) -> None:
+    """Half a second tells no cutoff below 1 Hz from none; the fraction is found all the same."""
+    recording = recorded(replace(HAND, seed=seed, frames=16, stabilised=(0.2, 0.002)))
+    found = settled(recording, replace(recording.profile, extensions=Extensions()))
+    assert found.profile.extensions.stabilisation_fraction == pytest.approx(0.2, abs=0.03)
+    assert found.after_px < 1.3 * found.noise_px
+    assert focal_px(found.profile) == pytest.approx(520.0, rel=1e-9)
+
+
 def test_clocks_that_drift_are_found_where_the_offset_is_stated_and_where_it_is_not() -> None:
     """Skews of 0.01 over two seconds; an unknown offset is fitted along."""
     recording = recorded(replace(HAND, clock_skew=0.01, frames=50, points=25))
