@@ -34,6 +34,8 @@ EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
 """Names that ``--with`` accepts."""
 MAX_FRAMES = 400
 """Captures up to this length (13 s at 30 frames/s) use every frame; longer ones use runs with this total."""
+MAX_AGAIN = 200
+"""Most frames that are tracked again in equally blurred frames: at 30 points a frame, as many as the fit uses."""
 FIT_STEPS = 3
 MORE_MOTION = "record a few more seconds while rotating the phone about all three axes"
 UNEXPLAINED = 1.5
@@ -59,11 +61,13 @@ class CalibrationPlan:
     extra: tuple[str, ...]
     frames: tuple[int, ...]
     """Movie indices of the frames to track."""
+    again: tuple[int, ...] = ()
+    """Movie indices of the frames to track again in equally blurred frames."""
 
     @property
     def steps(self) -> int:
-        """Number of steps that ``progress`` counts: frames are tracked twice at most."""
-        return 2 * len(self.frames) + FIT_STEPS
+        """Most steps that ``progress`` counts."""
+        return len(self.frames) + len(self.again) + FIT_STEPS
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +120,8 @@ def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str
             f"{capture.name}: no frame can be used: {capture.frames[0].skip_reason}",
             hint="run virest inspect on it, or record longer",
         )
-    return CalibrationPlan(capture, profile, source, _imu_file(source), tuple(extra), tuple(frames))
+    again = high_motion_frames(capture.frames, capture.imu, MAX_AGAIN, profile.time_offset_s or 0.0)
+    return CalibrationPlan(capture, profile, source, _imu_file(source), tuple(extra), tuple(frames), tuple(again))
 
 
 def choose_frames(capture: Capture, profile: CameraProfile, with_startup: bool = False) -> list[int]:
@@ -168,7 +173,7 @@ def find_calibration(
     pairs = track_guided(plan.capture, plan.profile, gray, plan.frames, each, step)
 
     def track_again(guide: Guide) -> list[TrackPair]:
-        return track_frames(gray, plan.frames, each, step, guide)
+        return track_frames(gray, plan.again, each, step, guide)
 
     found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1), track_again)
     _require_offset(found)

@@ -112,7 +112,7 @@ def calibrate_folder(folder: Path, extra: Sequence[str] = ()) -> GeometryCalibra
     plan = plan_calibration(folder, None, extra)
     gray = GrayReader.of(plan.capture.movie)
     pairs = track_guided(plan.capture, plan.profile, gray, plan.frames)
-    again = partial(track_frames, gray, plan.frames)
+    again = partial(track_frames, gray, plan.again)
     return calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, track_again=lambda g: again(guide=g))
 
 
