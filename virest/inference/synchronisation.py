@@ -44,7 +44,7 @@ MAX_FOCAL_RESIDUAL = 1.5
 point 9 px off leaves 1.15 to 1.4, with focal errors below 0.1 % (tracks from three analytic motions)."""
 MAX_FOCAL_SPREAD = 0.25
 """Largest relative standard deviation of a focal length that is reported."""
-DRIFT_P, LEAST_DRIFT = 6e-5, 5e-4
+DRIFT_P, LEAST_DRIFT = 1e-3, 5e-4
 """A drift is noted if it is larger, s per s, and chance makes one as significant with a smaller probability: Student's
 distribution with the time blocks that inform it, of which half a second has few."""
 NEAR_S = 0.01
