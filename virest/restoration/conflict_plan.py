@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.inference.camera_travel import VisualInertialAlignment
@@ -51,6 +53,7 @@ def settle(
             again = settle_conflict(observed, capture.imu, begun, offset_known=False, focal_known=focal_known)
             found = again if again.after_px < found.after_px else found
     followed = found.explained > FOLLOWED
+    plan = replace(plan, points_off_rad_s=_rate_off_rad_s(found, observed))
     if offset_known and not found.taken:
         return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
     if offset_known:
@@ -90,6 +93,15 @@ def _unexplained(found: Settled) -> str:
         f"{found.noise_px:.2f} px), and no focal length, gyroscope scale, clock skew or stabiliser explains it: "
         "virest diagnose"
     )
+
+
+def _rate_off_rad_s(found: Settled, observed: ObservedTracks) -> float | None:
+    """The rotation rate, per axis, that would move points as far as they still lie off beyond the tracking noise."""
+    lens = found.profile.intrinsics
+    if found.after_px < CONTRADICTED * found.noise_px or lens is None or not observed.pairs:
+        return None
+    period_s = float(np.median([observed.stamp_s[p.second] - observed.stamp_s[p.first] for p in observed.pairs]))
+    return float(np.sqrt(found.after_px**2 - found.noise_px**2) / (lens.fx_px * period_s))
 
 
 def _remaining_note(found: Settled) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from virest.inference.unsharp_mask import MOST_FRAMES, seen_mask, without_mask
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times, moved_over_frame
-from virest.restoration.neighbours.refinement import RefinedMotion
+from virest.restoration.neighbours.refinement import RefinedMotion, unmeasured_turn
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 from virest.restoration.neighbours.survey import path_length_px, survey_gain, survey_turns
 from virest.restoration.settings import PRESETS
@@ -50,7 +50,10 @@ def with_neighbour_survey(
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing, undetected_rad_s = survey_turns(runs, sights, neighbours, trajectory)
     plan = replace(plan, undetected_rad_s=undetected_rad_s)
-    if missing is not None:
+    if undetected_rad_s is None and plan.points_off_rad_s is not None:
+        missing = unmeasured_turn(plan.points_off_rad_s)
+        plan = replace(plan, missing_turn=missing)
+    elif missing is not None:
         note = (
             f"neighbouring frames rotate by {missing.rate_rad_s:.3f} rad/s rms more or less than predicted: "
             "each frame's motion is corrected by its neighbours"

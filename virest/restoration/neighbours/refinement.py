@@ -214,6 +214,11 @@ def unrefined_path_std_px(motion: RowMotion, rate_std_rad_s: float) -> float:
     return float(rate_std_rad_s * motion.exposure_s * np.sqrt(np.trace(jacobian @ jacobian.T) / 2))
 
 
+def unmeasured_turn(rate_rad_s: float) -> MissingTurn:
+    """A rotation of this standard deviation per axis that the prediction lacks, and that no pair of frames shows."""
+    return MissingTurn(rate_rad_s, rate_rad_s, HALF_SPACING * rate_rad_s, 0.0, 0)
+
+
 def following_turn(turns: Sequence[PairTurn], trajectory: Trajectory) -> FollowingTurn:
     """Fit the lag and the part to pairs' missing rates, with their priors (ridge regression)."""
     design = np.concatenate([np.stack(_change_and_mean(turn, trajectory), -1) for turn in turns])
