@@ -63,7 +63,7 @@ class RestorationPlan:
     """Rotation that neighbouring frames show and the prediction lacks; None: none, or not measurable."""
 
     points_off_rad_s: float | None = None
-    """Standard deviation, per axis, of the rotation rate that tracked points lack, if they lie off; None: they do not."""
+    """Standard deviation, per axis, of the rotation rate by which tracked points lie off; None: they do not."""
 
     undetected_rad_s: float | None = None
     """Standard deviation, per axis, of a missing rotation rate that the frames do not show; None: not measurable."""

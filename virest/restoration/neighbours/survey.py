@@ -28,7 +28,7 @@ TELLING_PX = 3.0
 
 
 def survey_runs(numbers: Iterable[int], path_px: Mapping[int, float]) -> list[tuple[int, ...]]:
-    """At most MOST_RUNS runs of consecutive frames, the most blurred of each unbroken stretch, evenly spaced.
+    """At most MOST_RUNS runs of consecutive frames, the most blurred of each part of the capture, evenly spaced.
 
     numbers: frames to choose from.  path_px: approximate blur path length by frame index.
     """
@@ -38,7 +38,7 @@ def survey_runs(numbers: Iterable[int], path_px: Mapping[int, float]) -> list[tu
     runs = []
     for stretch in np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1):
         pieces = np.array_split(stretch, max(1, min(len(stretch) // RUN_FRAMES, MOST_RUNS)))
-        for piece in pieces if len(stretch) <= MOST_RUNS * RUN_FRAMES else [stretch]:
+        for piece in pieces:
             starts = range(max(len(piece) - RUN_FRAMES + 1, 1))
             blur = [sum(path_px.get(int(n), 0.0) for n in piece[k : k + RUN_FRAMES]) for k in starts]
             best = int(np.argmax(blur))
