@@ -43,7 +43,7 @@ def test_the_most_blurred_frames_of_each_part_are_compared() -> None:
 def test_points_that_lie_off_count_where_no_pair_of_frames_shows_the_turn(
     tmp_path: Path, rng: np.random.Generator, off_rad_s: float | None
 ) -> None:
-    """Pictures of noise show nothing; the turn that the points lack then makes every path uncertain, and nothing else."""
+    """Noise shows nothing; the turn that the points lack then makes every path uncertain, and nothing else."""
     simulate_command(tmp_path / "noise", width=320, height=240, frames=6, rate_rad_s=1.0, truth_frames=False)
     capture = read_capture(tmp_path / "noise")
     profile, _ = resolve_profile(capture, None)
