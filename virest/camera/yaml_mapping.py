@@ -13,8 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from virest.errors import SettingsError, printable
 
-MAX_PROFILE_BYTES = 1_000_000
-MAX_DEPTH = 20
+MAX_PROFILE_BYTES, MAX_DEPTH = 1_000_000, 20
 """A profile has some kilobytes and four levels; the limits stop files that would exhaust the memory or the stack."""
 OPENCV_HEAD = re.compile(r"\A\ufeff?%YAML:1\.0[^\n]*")
 """First line of OpenCV's files, which is not a valid YAML directive."""

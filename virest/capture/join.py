@@ -23,8 +23,7 @@ MOST_DRIFT = 1e-3
 """Largest relative difference of a movie's nominal frame rate from the sensor's; crystals differ by 1/20 of it."""
 MIN_MATCHED_FRACTION = 0.8
 """If fewer of the frames match a timestamp, movie and timestamps come from different recordings."""
-MAX_CANDIDATES = 20_000
-SCORED_FRAMES = 500
+MAX_CANDIDATES, SCORED_FRAMES = 20_000, 500
 """Limits on the work for long recordings: 11 min at 30 frames/s to align with, of which 500 frames are scored first."""
 GAP_PERIODS = 5.0
 """A gap is longer than this many median periods; the gyroscope's spline is then interrupted."""

@@ -63,6 +63,7 @@ SIMPLER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length"}
 """For slow rotations a low-pass filter is a delay; along one image direction a pixel aspect is a focal length.  Where
 the points cannot distinguish the two, the simpler cause is reported, with the other as its rival."""
 MAX_RUNGS = 5
+"""Causes, or pairs of them, that may enter: a limit on time.  A rung with six of them to try takes 0.3 s."""
 
 
 def climb(

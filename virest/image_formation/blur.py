@@ -20,6 +20,8 @@ from virest.image_formation import transforms
 
 Image = NDArray[np.float32]
 FAST_SIZES = (64, 80, 96, 128, 144, 160, 176, 192, 240, 256, 288, 320, 384, 480, 512, 640, 768, 1024)
+"""Sides of square tiles whose transform is fast: from 96 px on at most 1.4 ns a pixel, while the other sizes that
+``cv2.getOptimalDFTSize`` returns up to 640 px take 1.2 to 3.2 ns."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,11 +23,13 @@ from virest.image_formation.row_clock import ROW_END, ROW_START
 from virest.image_formation.row_motion import RowMotion
 from virest.image_formation.warp import PIXELS_WITHIN_PX, moved_between, seen_by_rows
 
-SAMPLES_PER_PX = 2.0
-MIN_SAMPLES = 16
+SAMPLES_PER_PX, MIN_SAMPLES = 2.0, 16
+"""Samples along a path, per pixel and at least.  Spectra of curved kernels of 1 to 30 px err by up to 0.4 %; with
+half or twice as many samples per pixel by 0.7 or 0.1 %, with half or twice the minimum by 0.5 or 0.2 %."""
 NODE_STEP_S = 2e-3
 """Spacing of a path's computed instants, with a cubic spline between: errs by 0.7 % of a vibration at 100 Hz."""
 MIN_NODES = 8
+"""Nodes of exposures up to 14 ms: half or twice as many change restored frames of 10 ms by 0.01 grey levels (rms)."""
 ACROSS_PX, MIN_KNOTS = 160, 5
 """Knots of splines over the picture: largest spacing in pixels, and smallest number along each side."""
 

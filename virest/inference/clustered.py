@@ -13,6 +13,7 @@ import numpy as np
 from virest.arrays import Array, Index
 
 RELATIVE_FLOOR = 1e-9
+"""Part of the curvature's variance that stays if all errors cancel: 3e-5 of a standard deviation."""
 ABSORBED_FLOOR = 1e-12
 """Relative eigenvalue below which a direction is rounding error."""
 LEAST_LEFT = 0.05
@@ -108,7 +109,7 @@ class CovarianceModel:
         places = np.maximum(_diagonal(slope @ self.by_region @ back), 0.0)
         share = np.sqrt(1 + places / np.maximum(_diagonal(sandwich), 1e-300))
         total = sandwich * share[..., :, None] * share[..., None, :] + slope @ self.prior @ back
-        return raised(total + RELATIVE_FLOOR * least, least)  # keeps variances positive if all errors cancel
+        return raised(total + RELATIVE_FLOOR * least, least)
 
 
 def _diagonal(matrix: Array) -> Array:

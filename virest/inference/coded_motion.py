@@ -45,6 +45,7 @@ LEAST_SLOPE = 1e-4
 MOST_SLOPE = 1.0
 """Largest change of a step per pixel; larger values belong to points where the lens model folds back."""
 LEAST_CURVED_PX = 1e-3
+"""Guard against a division by zero.  A flow is flattened by at most its curvature, here 0.001 px."""
 
 
 @dataclass(frozen=True, slots=True)

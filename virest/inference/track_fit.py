@@ -37,7 +37,9 @@ from virest.inference.travel_start import linear_start
 from virest.motion.scene_motion import DirectedMotion, InertialMotion, Motion
 
 GRAVITY_M_S2 = 9.81
+"""Rounded; on Earth it lies between 9.78 and 9.83 m/s² (WGS 84)."""
 MIN_BLOCKS = 4
+"""Fewest time blocks for a variance.  That of n blocks has a relative deviation of √(2 / (n − 1)): 0.8 for four."""
 REGIONS = 5
 """Image regions along each side; a wall or a ceiling fills some of them."""
 ONE_DIRECTION = 1.15

@@ -24,6 +24,8 @@ PART_FRAMES = 60
 LEAD_FRAMES = 2
 """The frame before a part's first, to pair with it, and one more, to detect whether that frame is a repeat."""
 CORNER_BLOCK_PX = 5
+"""Side of the square over which the structure tensor is averaged.  On 45 simulated frames 3, 5 and 9 px give 8499, 8381
+and 7434 tracks with a noise of 0.121, 0.123 and 0.116 px."""
 CORNER_SPACING_PX = 7
 """A corner is the strongest in a square of this side."""
 OUTSIDE_PX = 1e6

@@ -13,13 +13,12 @@ import numpy as np
 
 from virest.arrays import Array, Index
 
-VELOCITY_STD_M_S = 1.0
-GRAVITY_STD_M_S2 = 0.6
-ACCEL_BIAS_STD_M_S2 = 0.15
-ACCEL_DELAY_STD_S = 0.004
-PLANE_STD_PER_M = 1.5
-"""Standard deviations of the priors: walking pace; gravity's direction to 3.5°; an accelerometer's bias of 15 mg; a
-delay of one sample at 250 Hz; a scene at 0.7 m or farther."""
+VELOCITY_STD_M_S, PLANE_STD_PER_M = 1.0, 1.5
+"""Standard deviations of the priors: walking pace; a scene at 0.7 m or farther.  Half or twice the velocity's changes
+no estimate of a diagnosis of 45 frames, 0.8 m before a wall."""
+GRAVITY_STD_M_S2, ACCEL_BIAS_STD_M_S2, ACCEL_DELAY_STD_S = 0.6, 0.15, 0.004
+"""The same: gravity's direction to 3.5°; a bias of 15 mg; a delay of one sample at 250 Hz.  Half or twice each
+changes no estimate of that diagnosis in its first four digits, and deviations by up to 11 %."""
 
 
 @dataclass(frozen=True, slots=True)

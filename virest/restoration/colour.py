@@ -33,12 +33,10 @@ from virest.restoration.tile_layout import (
 )
 
 COLOUR_SCALE, COARSE_COLOUR_SCALE = 2, 4
+"""Reductions of the colour differences: a movie (4:2:0) stores them at half size.  The coarse scale, used with few
+iterations, costs up to 0.05 dB."""
 COLOUR_TILE_PX = 192
-"""Reductions of the colour differences, and side of their tiles: they hold so little detail that larger tiles and
-pixels are sufficient.
-
-The coarse scale, used with few iterations, costs up to 0.05 dB.
-"""
+"""Side of their tiles, which may be larger than the luma's: colour differences hold little detail."""
 COARSE_COLOUR_BLUR_PX = COARSE_COLOUR_SCALE * 3**0.5
 """Path length L that blurs as much as the coarse scale s does: block means have variance s²/12 and linear interpolation
 s²/6, against L²/12.  With shorter paths the coarse scale would lose detail."""

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from virest.arrays import Array
 from virest.errors import SettingsError
 
-NOMINAL_ISO = 144
-LOWEST_ISO = 50
-"""ISO without auto-exposure, and the lowest of a phone's sensor."""
+NOMINAL_ISO, LOWEST_ISO = 144, 50
+"""ISO without auto-exposure, and the lowest of a phone's sensor, 1.5 EV below."""
 MAX_RANGE_EV = 12.0
+"""A factor of 4096: from full sun (EV 15) to a floodlit building at night (EV 3)."""
 WALK_WAVES = 4
 """Cosines of 0.6, 1.2, 1.8 and 2.4 periods per capture, amplitude ∝ 1 / periods, so adjacent frames differ little."""
 

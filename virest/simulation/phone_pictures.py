@@ -19,9 +19,8 @@ Image = NDArray[Any]
 
 SPACE_SIGMA_PX, SPACE_WINDOW_PX = 2.0, 9
 """Spatial sigma of the bilateral filter, and its window width."""
-CHROMA_RADIUS_PX = 4
 CHROMA_TIMES_LUMA = 2.0
-"""Colour is smoothed over a larger area and more strongly than luma: the eye resolves it less."""
+"""Colour is smoothed more strongly than luma, by boxes of the whole window: the eye resolves it less."""
 MOTION_BOX_PX = 5
 """Width of the box over which frame differences are averaged for motion detection."""
 STILL_SIGMAS = 3.0
@@ -115,7 +114,7 @@ def denoise_in_space(grey: Image, range_sigma: float) -> Image:
     luma = cv2.bilateralFilter(parts[0], SPACE_WINDOW_PX, range_sigma, SPACE_SIGMA_PX, borderType=cv2.BORDER_REFLECT)
     planes = [luma]
     for chroma in parts[1:]:
-        slope, level = _guided(luma, chroma, CHROMA_RADIUS_PX, (CHROMA_TIMES_LUMA * range_sigma) ** 2)
+        slope, level = _guided(luma, chroma, SPACE_WINDOW_PX // 2, (CHROMA_TIMES_LUMA * range_sigma) ** 2)
         planes.append(slope * luma + level)
     return cv2.transform(cv2.merge(planes), _FROM_YCC)
 

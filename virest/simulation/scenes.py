@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 
 KINDS = ("leaves", "colours", "bright", "board", "text", "photographs")
 LENS_SIGMA_PX = 0.5
+"""Blur of lens and pixel, contrast 0.29 at the Nyquist frequency: pixels of 1.2 µm behind a diffraction-limited f/1.8
+leave 0.31 at 0.55 µm, 0.64 for the pixel's aperture times 0.49 for diffraction."""
 MAX_CHART_PX = 36_000_000
 """0.4 GB as 32-bit RGB."""
 PHOTOGRAPHS = ("astronaut", "chelsea", "coffee", "rocket")

@@ -38,9 +38,9 @@ STAMP_FRACTION = {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end":
 """Position of the timestamp within the exposure."""
 DEFAULT_SWAY_M = 0.012
 """Default RMS sway of the hand for a scene of finite depth."""
-LONGEST_EXPOSURE_S = 10.0
-LONGEST_OFFSET_S = 600.0
-FASTEST_HAND_RAD_S = 100.0
+LONGEST_EXPOSURE_S, LONGEST_OFFSET_S, FASTEST_HAND_RAD_S = 10.0, 600.0, 100.0
+"""Limits of the renderer: 300 frame periods at 30 frames/s; 120 000 more inertial samples at 200 Hz; three times the
+full scale of phone gyroscopes (35 rad/s)."""
 NEAREST_M, FARTHEST_M = 0.001, 1e6
 """Limits of the renderer, far beyond any phone's recording."""
 FOCAL_OF_LONG_SIDE = (0.05, 100.0)

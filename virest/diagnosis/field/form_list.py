@@ -21,9 +21,16 @@ from virest.capture.records import Capture
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
 
 ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5
+"""Knots of the coarse forms.  The fewer, the weaker an effect they detect: a cubic spline through 4, 5, 6 or 7 knots
+follows 0.7, 1.0, 1.4 or 1.7 periods over its range to 10 % (rms)."""
 FINE_ROW_KNOTS, FINE_PLACE_KNOTS, FINE_RATE_KNOTS = 21, 7, 13
-MOST_KNOTS, MOST_PLACE_KNOTS, MOST_RATE_KNOTS = 41, 10, 25
-PAIR_ROW_KNOTS, PAIR_RADIUS_KNOTS = 3, 3
+"""Knots of the fine forms, which follow 6.5, 1.7 and 3.6 periods: jumps of the row, dents of a window, a dead zone."""
+MOST_KNOTS, MOST_RATE_KNOTS = 2 * FINE_ROW_KNOTS - 1, 2 * FINE_RATE_KNOTS - 1
+"""Knots after one refinement of the fine forms."""
+MOST_PLACE_KNOTS = FINE_PLACE_KNOTS + PLACE_KNOTS - 1
+"""The same for maps."""
+PAIR_KNOTS = 3
+"""Knots over the row or the radius in a pair: a parabola, and 0 at the first knot."""
 LEAST_TIMES, TIME_STEPS = 4, ((0.4, 12), (0.1, MOST_KNOTS))
 """(knot spacing in s, maximum number of knots) over time, coarse and fine.  0.1 s is 3 frames; a hunting focus has a
 period of 0.5 s."""
@@ -81,10 +88,10 @@ def forms_of_pairs(
     stamp, mean = capture.stamp_0_ns, np.ones((1, len(times)))
     forms = []
     if profile.shutter.readout_time_s > 0:
-        rows = np.linspace(0, 1, PAIR_ROW_KNOTS)
+        rows = np.linspace(0, 1, PAIR_KNOTS)
         late = _zero("delay", ("row", TIME), [rows, np.asarray(profile.camera_time_s(times))], stamp)
         forms.append(_product((late,), [np.eye(len(rows))[:, 1:]], mean, READOUTS, known))
-    radii = np.linspace(0, 0.5 * np.hypot(profile.width, profile.height), PAIR_RADIUS_KNOTS)
+    radii = np.linspace(0, 0.5 * np.hypot(profile.width, profile.height), PAIR_KNOTS)
     outwards = [np.eye(len(radii))[:, 1:]]
     drawn = _zero("scale", ("radius", TIME), [radii, times], stamp)
     forms.append(_product((drawn,), outwards, mean, LENSES, known))

@@ -28,6 +28,8 @@ CLOSE_P, MANY_FLIPS, FLIPS_AT_ONCE = 0.1, 200_000, 20_000
 scores large but bounded, and the gamma distribution with their moments has a longer tail."""
 FOLDS, PARTS = 5, 4
 """Interleaved folds for the held-out gain; consecutive parts of the capture for what must not depend on time."""
+MIN_BLOCKS = 8
+"""Fewest time blocks: two in each of the PARTS.  Their gain exceeds MIN_T by chance in 1 % of cases (Student's t)."""
 MIN_OUTSIDE_FRACTION = 1e-3
 """Drop a direction when less than this fraction of it lies outside the tangent space of the named causes."""
 RIDGE = 1e-3

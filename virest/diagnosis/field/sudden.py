@@ -29,6 +29,8 @@ frames around a change, and its instants are off by up to half of that."""
 LEAST_SCALE = 1e-9
 """Guard against a division by zero."""
 _ITERATIONS = 8
+"""Passes against outliers: of 20 points, 15 % of them outliers, half as many passes change the growth by 0.5 of its
+standard deviation (rms), twice as many by 0.1."""
 
 
 @dataclass(frozen=True, slots=True)

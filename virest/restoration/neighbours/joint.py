@@ -24,7 +24,7 @@ from virest.image_formation.kernel_spread import KernelSpread
 from virest.image_formation.kernels import KernelField
 from virest.image_formation.neighbour import NeighbourView
 from virest.restoration.neighbours.reduced_tiles import TILE
-from virest.restoration.neighbours.registration import TileAgreement
+from virest.restoration.neighbours.registration import HUBER, TileAgreement
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.rings import RINGS, SIDE, place_ring
 from virest.restoration.statistics.tile_power import passed_power
@@ -54,7 +54,8 @@ LEAST_SHIFTS = 6
 """An affine field of shifts has six unknowns; twice as many tiles are required."""
 LOOKED_AT = 6
 """Number of kernels from which a neighbour's |K|² is estimated."""
-HUBER, ROBUST_STEPS = 1.5, 6
+ROBUST_STEPS = 6
+"""Passes against outliers: half or twice as many change restored frames by 0.10 or 0.03 grey levels (rms)."""
 REACHES, PARTS = (1.0, 2.0, 4.0), tuple(np.sort(1 - np.geomspace(1.0, 1e-4, 17)).tolist())
 """Tried reaches of the shifts' common part, in tiles' sides, and its parts of their power; the rest is noise, never
 0."""

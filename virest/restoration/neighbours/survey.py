@@ -22,6 +22,8 @@ from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 RUN_FRAMES = 4
 """Length of a run: three pairs, so that the middle one tests linear interpolation between the outer ones."""
 MOST_RUNS = 4
+"""Runs of a survey: one frame of each, compared with both neighbours, gives eight shares.  A run of 320 × 240 px takes
+0.2 s."""
 TELLING_PX = 3.0
 """Blur paths of this length cancel ⅓ cycle per pixel; frames are compared up to ¼.  On eleven simulated captures 36 of
 38 shares of frames with longer paths were positive, against 12 of 40 for paths of 1 to 2.5 px."""

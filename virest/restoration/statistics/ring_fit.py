@@ -16,8 +16,10 @@ from virest.restoration.statistics.records import (
 )
 from virest.restoration.statistics.rings import RINGS, SIDE, ring_index
 
-_FIT_STEPS = 6
+FIT_STEPS = 6
+"""Reweighted fits of a ring: half as many change restored frames by 0.06 grey levels (rms), twice as many by 0.01."""
 _CELLS = 64
+"""Cells of |K|² in a ring: half or twice as many change restored frames by 0.14 or 0.11 grey levels (rms)."""
 _MUST_CANCEL = 0.45
 """Mean |K|² of a ring above which the kernels cancel too little to tell noise from signal."""
 _STEEPEST_NOISE, _LEVEL_BELOW = 2.0, 0.08
@@ -84,7 +86,7 @@ def fit_rings(
     mean_k, mean_g = (count * k).sum(-1) / in_ring, (count * g).sum(-1) / in_ring
     signal, noise = 0.9 * mean_g / np.maximum(mean_k, 0.05), 0.1 * mean_g
     products = np.stack([np.ones_like(k), k, k * k, g, k * g], -1)
-    for _ in range(_FIT_STEPS):
+    for _ in range(FIT_STEPS):
         expected = np.maximum(noise[..., None] + signal[..., None] * k, 1e-6)
         weight = count / (expected * np.sqrt(expected))
         w, wk, wkk, wg, wkg = np.moveaxis((weight[..., None, :] @ products)[..., 0, :], -1, 0)
