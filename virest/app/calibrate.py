@@ -120,7 +120,9 @@ def plan_calibration(path: Path, config: Path | None = None, extra: Sequence[str
             f"{capture.name}: no frame can be used: {capture.frames[0].skip_reason}",
             hint="run virest inspect on it, or record longer",
         )
-    again = high_motion_frames(capture.frames, capture.imu, MAX_AGAIN, profile.time_offset_s or 0.0)
+    again = frames
+    if len(frames) > MAX_AGAIN:
+        again = high_motion_frames(capture.frames, capture.imu, MAX_AGAIN, profile.time_offset_s or 0.0)
     return CalibrationPlan(capture, profile, source, _imu_file(source), tuple(extra), tuple(frames), tuple(again))
 
 
