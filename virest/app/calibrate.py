@@ -34,8 +34,8 @@ EXTRA_NAMES = tuple(dict.fromkeys((*OPTIONAL, FRAME_LAG)))
 """Names that ``--with`` accepts."""
 MAX_FRAMES = 400
 """Captures up to this length (13 s at 30 frames/s) use every frame; longer ones use runs with this total."""
-MAX_AGAIN = 200
-"""Most frames that are tracked again in equally blurred frames: at 30 points a frame, as many as the fit uses."""
+MAX_AGAIN = 120
+"""Most frames that are tracked again in equally blurred frames: with 60 points each, as many as the fit uses."""
 FIT_STEPS = 3
 MORE_MOTION = "record a few more seconds while rotating the phone about all three axes"
 UNEXPLAINED = 1.5
