@@ -72,6 +72,16 @@ def test_equal_blur_brings_the_readout_nearer(capture: Callable[..., Path], dept
     assert off_s[1] < 0.5 * off_s[0]
 
 
+def test_frames_in_which_no_point_is_found_again_change_nothing(capture: Callable[..., Path]) -> None:
+    """The first tracking then stands."""
+    plan = plan_calibration(capture("alone", seed=55))
+    pairs = track_guided(plan.capture, plan.profile, GrayReader.of(plan.capture.movie), plan.frames)
+    once, again = (
+        calibrate_geometry(plan.capture, plan.profile, pairs, track_again=none) for none in (None, lambda _guide: [])
+    )
+    assert again.profile == once.profile
+
+
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_global_shutter_is_found(capture: Callable[..., Path], hidden: bool) -> None:
     """Whether the profile states it or gives 20 ms: the readout is 0, has no direction, and the offset is right."""

@@ -129,7 +129,7 @@ def calibrate_geometry(
     """Fit time offset, readout, IMU–camera rotation, gyroscope bias and the terms in ``extra``.
 
     extra: keys of OPTIONAL, and FRAME_LAG.  progress: called with the name of each finished stage.  track_again: tracks
-    the same frames with a guide; once a fit explains the points, they are tracked in equally blurred frames.  Raises
+    frames with a guide; once a fit explains the points, they are tracked in equally blurred frames.  Raises
     CalibrationError if the data do not determine even the offset: a camera at rest, a steady pan, too few points,
     frames that do not follow the gyroscope.
     """
@@ -168,8 +168,9 @@ def calibrate_geometry(
     if track_again is not None and explained and is_blurred(joint.fit, joint.table):
         even = observe_tracks(capture, track_again(even_guide(capture, joint.fit, joint.table)), profile)
         even = (even if lag is None else _at_true_times(capture, even, lag)).covered(capture.imu, start)
-        fitted = replace(rough, profile=joint.fit.profile, scene=joint.fit.scene)
-        joint = _fit_jointly(capture.imu, even, fitted, names, even_blur=True)
+        if len(even.pairs) >= MIN_PAIRS:
+            fitted = replace(rough, profile=joint.fit.profile, scene=joint.fit.scene)
+            joint = _fit_jointly(capture.imu, even, fitted, names, even_blur=True)
     found = _conclude(capture.imu, profile, start, coarse, rough, joint)
     if drifted:
         found = replace(found, notes=(_drift_note(found, profile.clock_skew), *found.notes))
@@ -417,10 +418,12 @@ def _fit_jointly(
     if isinstance(fit.scene, InertialMotion):
         errors_px.append(path_errors_px(imu, fit.integrated, table, fit.scene))
     if corrected:  # without an accelerometer the blur due to translation is unknown
-        blur_px = blur_bias_px(fit.integrated, table, np.array([pair.guided for pair in observed.pairs]))
+        guided = np.array([pair.guided for pair in observed.pairs])
+        blur_px = blur_bias_px(fit.integrated, table, guided)
         coding_px = coding_bias_px(fit.integrated, table, fit.scene)
-        table = replace(table, second_px=table.second_px - (0.0 if even_blur else blur_px) - coding_px)
-        errors_px.append((LEFT_BY_EVEN_BLUR if even_blur else RELATIVE_STD) * blur_px[None])
+        even = (even_blur & guided)[table.pair, None]
+        table = replace(table, second_px=table.second_px - np.where(even, 0.0, blur_px) - coding_px)
+        errors_px.append(np.where(even, LEFT_BY_EVEN_BLUR, RELATIVE_STD)[None] * blur_px)
     if errors_px:
         fit = fit_tracks(imu, table, fit.profile, wanted, fit.scene, errors_px=np.concatenate(errors_px))
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S

@@ -49,16 +49,15 @@ def with_neighbour_survey(
     plan, sights = _without_sharpening(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing, undetected_rad_s = survey_turns(runs, sights, neighbours, trajectory)
-    plan = replace(plan, undetected_rad_s=undetected_rad_s)
     if undetected_rad_s is None and plan.points_off_rad_s is not None:
         missing = unmeasured_turn(plan.points_off_rad_s)
-        plan = replace(plan, missing_turn=missing)
     elif missing is not None:
         note = (
             f"neighbouring frames rotate by {missing.rate_rad_s:.3f} rad/s rms more or less than predicted: "
             "each frame's motion is corrected by its neighbours"
         )
-        plan = replace(plan, missing_turn=missing, notes=(*plan.notes, note))
+        plan = replace(plan, notes=(*plan.notes, note))
+    plan = replace(plan, missing_turn=missing, undetected_rad_s=undetected_rad_s)
     if plan.settings.deblur == "none":
         return plan
     quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +20,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from virest.app.bench.workload import Scale
-from virest.app.calibrate import plan_calibration
+from virest.app.calibrate import find_calibration, plan_calibration
 from virest.app.console import numeric_table
 from virest.app.simulate import simulate_command
 from virest.arrays import Array
 from virest.calibration.calibrated_values import CalibratedValue
-from virest.calibration.geometry import GeometryCalibration, calibrate_geometry
+from virest.calibration.geometry import GeometryCalibration
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import read_profile
-from virest.capture.video import GrayReader
 from virest.errors import VirestError
-from virest.inference.guide_choice import track_guided
 from virest.inference.robust import NORMAL_MEDIAN
-from virest.inference.tracking import track_frames
 from virest.inference.tracking_bias import EVEN_SHARED, shared_std
 from virest.report.figures import deviation_figure
 
@@ -109,11 +105,7 @@ def calibrated_rows(work: Path, seed: int) -> list[Row]:
 
 def calibrate_folder(folder: Path, extra: Sequence[str] = ()) -> GeometryCalibration:
     """Calibrate a capture as ``virest calibrate --with EXTRA`` does, without writing a profile."""
-    plan = plan_calibration(folder, None, extra)
-    gray = GrayReader.of(plan.capture.movie)
-    pairs = track_guided(plan.capture, plan.profile, gray, plan.frames)
-    again = partial(track_frames, gray, plan.again)
-    return calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, track_again=lambda g: again(guide=g))
+    return find_calibration(plan_calibration(folder, None, extra))[1]
 
 
 def errors_of(found: GeometryCalibration, truth: CameraProfile) -> list[Row]:

@@ -215,7 +215,10 @@ def unrefined_path_std_px(motion: RowMotion, rate_std_rad_s: float) -> float:
 
 
 def unmeasured_turn(rate_rad_s: float) -> MissingTurn:
-    """A rotation of this standard deviation per axis that the prediction lacks, and that no pair of frames shows."""
+    """A rotation of this standard deviation per axis that the prediction lacks, and that no surveyed pair shows.
+
+    The usual scatter of tiles is unknown, so a pair beyond FARTHEST deviations is rejected however its tiles agree.
+    """
     return MissingTurn(rate_rad_s, rate_rad_s, HALF_SPACING * rate_rad_s, 0.0, 0)
 
 
