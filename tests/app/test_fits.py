@@ -9,14 +9,14 @@ from virest.app.bench.workload import Scale, honesty_workloads
 
 def test_known_coefficients_come_back():
     """Gains made by a law, with a little noise, give the law again within its deviations."""
-    rng, law = np.random.default_rng(3), np.array([1.0, 0.5, 0.2, 0.6])
+    rng, law = np.random.default_rng(3), np.array([1.0, 0.5, 0.2, 0.3, 0.6])
     rows = []
     for k in range(240):
         of_colour = np.exp(rng.normal(3.0, 1.0))
-        means, scatter = (-2.5, 4.0, -4.0, 1.0, 6.0), (0.8, 1.0, 1.0, 1.0, 1.0)
-        ideal, removed, left, misplaced, power = np.exp(rng.normal(means, scatter))
-        logarithms = np.log([np.e, ideal, left])
-        off, left = np.array([0.0, misplaced]), power * np.exp(logarithms @ law[:3]) + law[3] * of_colour
+        means, scatter = (-2.5, 4.0, -4.0, -3.0, 1.0, 6.0), (0.8, 1.0, 1.0, 1.0, 1.0, 1.0)
+        ideal, removed, left, coded, misplaced, power = np.exp(rng.normal(means, scatter))
+        logarithms = np.log([np.e, ideal, left, coded])
+        off, left = np.array([0.0, misplaced]), power * np.exp(logarithms @ law[:4]) + law[4] * of_colour
         gain_db = np.mean(10 * np.log10((left + removed + off) / (left + 2 * off))) + rng.normal(0, 0.05)
         row = {"capture": f"c{k % 8}", "removed": removed, "misplaced": (off, 2 * off, (0.5, 0.5))}
         rows.append({**row, "regressors": [*logarithms, of_colour, power], "gain_db": gain_db})

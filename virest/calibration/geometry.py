@@ -40,6 +40,7 @@ from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.blur_bias import LEFT_BY_EVEN_BLUR, RELATIVE_STD, blur_bias_px
+from virest.inference.chance import student_tail
 from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.coded_motion import coding_bias_px
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
@@ -72,11 +73,12 @@ SMALL_PART = 0.01
 """Smallest fraction of points that a note states as a number."""
 CONSTANT_EXPOSURE_S = 1e-4
 """If exposures vary by less, an offset cannot be separated from their scale, nor from the timestamp reference."""
-SUSPECTED_SIGMA, DRIFT_SIGMA, LEAST_DRIFT_S = 3.0, 4.5, 1e-3
+SUSPECTED_SIGMA, DRIFT_P, LEAST_DRIFT_S = 3.0, 1e-5, 1e-3
 """Clock skew is fitted if one step from the fit without it exceeds SUSPECTED_SIGMA, and this much per capture.
 
-That step may be a part of the whole only, so the fit decides: the skew is kept if it exceeds DRIFT_SIGMA (false-alarm
-probability 7e-6)."""
+That step may be a part of the whole only, so the fit decides: the skew is kept if chance makes one as significant with
+a probability below DRIFT_P (Student's distribution with the time blocks that inform it, of which half a second has
+few)."""
 SMALL_DRIFT_S = 0.02
 """Below this drift per capture, and without translation, the fit with a skew starts from the one without."""
 OTHER_FOCAL = 0.1
@@ -162,7 +164,7 @@ def calibrate_geometry(
             near = _readout_axis(capture.imu, observed.table(FEW_POINTS), begun, with_skew)
         drifting = _fit_jointly(capture.imu, observed, near, with_skew)
         skewed = _conclude(capture.imu, profile, begun, again, near, drifting)
-        if abs(skewed.profile.clock_skew - profile.clock_skew) > DRIFT_SIGMA * _skew_std(skewed):
+        if _is_significant(skewed, profile.clock_skew):
             start, coarse, rough, joint, names, drifted = begun, again, near, drifting, with_skew, True
     explained = joint.corrected and joint.fit.scale < EXPLAINED_SCALE
     if track_again is not None and explained and is_blurred(joint.fit, joint.table):
@@ -195,6 +197,14 @@ def _may_drift(skew: HeldValue, span_s: float) -> bool:
     if skew.std[0] > calibrated("clock_skew").max_std:
         return False
     return skew.sigma > SUSPECTED_SIGMA and abs(float(skew.change[0])) * span_s > LEAST_DRIFT_S
+
+
+def _is_significant(skewed: GeometryCalibration, given_skew: float) -> bool:
+    """Whether chance hardly ever makes a clock skew as far from the given one as the fitted skew is."""
+    fit = skewed.fit
+    freedom = max(float(fit.stretches[fit.slices["clock_skew"]][0]) - 1, 1.0)
+    sigma = abs(skewed.profile.clock_skew - given_skew) / _skew_std(skewed)
+    return 2 * student_tail(sigma, freedom) < DRIFT_P
 
 
 def _skew_std(found: GeometryCalibration) -> float:

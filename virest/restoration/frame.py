@@ -42,7 +42,7 @@ from virest.restoration.row_chunks import RowRenderer, bands
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
-from virest.restoration.statistics.records import PictureStatistics
+from virest.restoration.statistics.records import PictureStatistics, coded_variance
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
 from virest.restoration.taken_part import blurred_part, no_gain_reason, share_map, trusted_share
 from virest.restoration.undistortion import undistortion_map
@@ -391,7 +391,9 @@ def _details(
     gain_db = None
     if confirmed is not None:
         colour = measured.chroma.colour_error()
-        gain_db = confirmed.of_change_db(changed, model.blur_error, ideal, model.sharp_power, misplaced, colour)
+        coded = measured.luma.noise_levels**2 if blur.coding_step is None else coded_variance(blur.coding_step)
+        power = model.sharp_power
+        gain_db = confirmed.of_change_db(changed, model.blur_error, ideal, power, coded, misplaced, colour)
     return Deblurring(
         method=settings.deblur,
         preset=settings.preset,

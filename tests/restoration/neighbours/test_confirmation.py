@@ -8,8 +8,8 @@ from virest.restoration.neighbours.survey import gain_test_candidates
 from virest.restoration.statistics.records import Misplaced
 
 FRAMES, PLACES = 2000, 16
-POWER = 400.0
-"""Of a sharp picture, grey levels squared."""
+POWER, CODED = 400.0, 6.0
+"""Of a sharp picture, and of its coder's error, grey levels squared."""
 
 
 def _filtered(strength: float) -> tuple[np.ndarray, np.ndarray]:
@@ -59,19 +59,21 @@ def test_too_few_pairs_or_no_change_confirm_nothing():
 def test_a_larger_change_promises_more_and_a_larger_rest_less():
     """The promise grows with what was changed and what was lost, falls with what is left, and has a deviation."""
     found, unlike = (ConfirmedGain(1.0, 0.2, left, 4) for left in (0.02, 0.1))
-    much = found.of_change_db(50.0, 80.0, 30.0, POWER)
-    less = [found.of_change_db(*asked, POWER) for asked in ((5.0, 80.0, 30.0), (50.0, 8.0, 30.0), (50.0, 80.0, 300.0))]
-    less.append(unlike.of_change_db(50.0, 80.0, 30.0, POWER))
+    much = found.of_change_db(50.0, 80.0, 30.0, POWER, CODED)
+    changed = ((5.0, 80.0, 30.0), (50.0, 8.0, 30.0), (50.0, 80.0, 300.0))
+    less = [found.of_change_db(*asked, POWER, CODED) for asked in changed]
+    less.append(unlike.of_change_db(50.0, 80.0, 30.0, POWER, CODED))
+    less.append(found.of_change_db(50.0, 80.0, 30.0, POWER, 10 * CODED))
     assert all(0 < gain_db < much[0] for gain_db, _ in less)
     assert all(deviation > 0 for _, deviation in (much, *less))
-    assert found.of_change_db(0.0, 80.0, 30.0, POWER)[0] == 0.0
+    assert found.of_change_db(0.0, 80.0, 30.0, POWER, CODED)[0] == 0.0
 
 
 def test_a_dimmer_picture_is_promised_the_same():
     """A quarter of the light's contrast is a sixteenth of every power: no gain changes by that."""
     found = ConfirmedGain(1.0, 0.2, 0.02, 4)
     bright, dim = (
-        found.of_change_db(50.0 * by, 80.0 * by, 30.0 * by, POWER * by, colour=(20.0 * by, 10.0 * by))
+        found.of_change_db(50.0 * by, 80.0 * by, 30.0 * by, POWER * by, CODED * by, colour=(20.0 * by, 10.0 * by))
         for by in (1.0, 1 / 16)
     )
     np.testing.assert_allclose(bright, dim, rtol=1e-6)
@@ -81,7 +83,7 @@ def test_colour_that_stays_blurred_promises_less_and_colour_that_is_removed_more
     """Saturated scenes have as much error in colour as in luma."""
     found = ConfirmedGain(1.0, 0.2, 0.02, 4)
     grey, stays, goes = (
-        found.of_change_db(50.0, 80.0, 30.0, POWER, colour=colour)[0]
+        found.of_change_db(50.0, 80.0, 30.0, POWER, CODED, colour=colour)[0]
         for colour in ((0.0, 0.0), (0.0, 100.0), (100.0, 0.0))
     )
     assert stays < grey < goes
@@ -91,7 +93,7 @@ def test_rows_that_lie_wrong_promise_less():
     """The more a sharp picture loses by its place over a blurred one, the less is promised; a loss is told as one."""
     found = ConfirmedGain(1.0, 0.2, 0.02, 4)
     in_place, less, lost = (
-        found.of_change_db(50.0, 80.0, 30.0, POWER, misplaced)[0]
+        found.of_change_db(50.0, 80.0, 30.0, POWER, CODED, misplaced)[0]
         for misplaced in (Misplaced(), _misplaced(20.0, 60.0), _misplaced(50.0, 400.0))
     )
     assert lost < 0 < less < in_place
@@ -100,9 +102,8 @@ def test_rows_that_lie_wrong_promise_less():
 def test_a_promise_of_next_to_nothing_still_has_a_deviation():
     """Rows that may lie anywhere within half a pixel: the mean gain is small, what it may be is not."""
     found = ConfirmedGain(1.0, 0.2, 0.02, 4)
-    off, in_place = (
-        found.of_change_db(5.0, 5.0, 5.0, POWER, misplaced) for misplaced in (_misplaced(40.0, 50.0), Misplaced())
-    )
+    places = _misplaced(40.0, 50.0), Misplaced()
+    off, in_place = (found.of_change_db(5.0, 5.0, 5.0, POWER, CODED, misplaced) for misplaced in places)
     assert 0 < off[0] < in_place[0]
     assert off[1] > in_place[1] > 0
 
@@ -110,7 +111,8 @@ def test_a_promise_of_next_to_nothing_still_has_a_deviation():
 def test_a_weaker_restoration_loses_less_by_its_place():
     """What was hardly changed can hardly be worse."""
     found = ConfirmedGain(1.0, 0.2, 0.02, 4)
-    weak, strong = (found.of_change_db(by, by, 30.0, POWER, _misplaced(50.0, 400.0, 80.0))[0] for by in (0.01, 60.0))
+    misplaced = _misplaced(50.0, 400.0, 80.0)
+    weak, strong = (found.of_change_db(by, by, 30.0, POWER, CODED, misplaced)[0] for by in (0.01, 60.0))
     assert strong < weak
     assert weak == pytest.approx(0.0, abs=0.01)
 
@@ -118,7 +120,7 @@ def test_a_weaker_restoration_loses_less_by_its_place():
 def test_two_tellers_that_disagree_widen_the_promise():
     """The same geometric mean of what was changed and what was lost, once alike and once a hundredfold apart."""
     found = ConfirmedGain(1.0, 0.0, 0.02, 4)
-    alike, apart = (found.of_change_db(changed, 100.0 / changed, 30.0, POWER) for changed in (10.0, 100.0))
+    alike, apart = (found.of_change_db(changed, 100.0 / changed, 30.0, POWER, CODED) for changed in (10.0, 100.0))
     assert alike[0] == pytest.approx(apart[0])
     assert apart[1] > 1.5 * alike[1]
 

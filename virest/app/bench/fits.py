@@ -34,7 +34,7 @@ from virest.restoration.statistics.records import Misplaced
 Row = dict[str, Any]
 OTHER_SEEDS = 1000
 """Added to the seeds of the test captures."""
-LEFT_OVER_NAMES = ("constant", "ideal filter's", "neighbours'", "colour's")
+LEFT_OVER_NAMES = ("constant", "ideal filter's", "neighbours'", "coder's", "colour's")
 LEFT_OVER_PRESETS = ("fast", "balanced")
 OUTLYING_DB = 0.5
 """Error of the predicted gain at which the soft-L1 loss departs from the square."""
@@ -94,7 +94,7 @@ def fit_left_over(rows: Sequence[Row]) -> Row:
     left_out = [_fitted([r for r in rows if r["capture"] != n], captures[captures != n]) for n in names]
     std = np.sqrt((len(names) - 1) * np.var(left_out, axis=0)) if len(names) > 1 else np.full(len(fitted), np.nan)
     off_db = np.abs(_promised_db(rows, fitted) - [row["gain_db"] for row in rows])
-    slopes = (_promised_db(rows, fitted - (0.05, 0, 0, 0)) - _promised_db(rows, fitted)) / 0.05
+    slopes = (_promised_db(rows, fitted - (0.05, 0, 0, 0, 0)) - _promised_db(rows, fitted)) / 0.05
     return {
         "coefficients": fitted.tolist(),
         "std": std.tolist(),
@@ -121,7 +121,7 @@ def best_value(values: Sequence[float], gains_db: Array) -> Row:
 class _RecordingGain(ConfirmedGain):
     """A ConfirmedGain that records the arguments of its calls."""
 
-    asked: list[tuple[float, float, float, float, Misplaced, tuple[float, float]]] = field(default_factory=list)
+    asked: list[tuple[float, float, float, float, float, Misplaced, tuple[float, float]]] = field(default_factory=list)
 
     def of_change_db(
         self,
@@ -129,11 +129,12 @@ class _RecordingGain(ConfirmedGain):
         lost: float,
         ideal: float,
         power: float,
+        coded: float,
         misplaced: Misplaced = confirmation.IN_PLACE,
         colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
-        self.asked.append((changed, lost, ideal, power, misplaced, colour))
-        return ConfirmedGain.of_change_db(self, changed, lost, ideal, power, misplaced, colour)
+        self.asked.append((changed, lost, ideal, power, coded, misplaced, colour))
+        return ConfirmedGain.of_change_db(self, changed, lost, ideal, power, coded, misplaced, colour)
 
 
 def _opened(work: Path, workload: Workload) -> TrueCapture:
@@ -164,7 +165,7 @@ def _promises(
         for restored in truth.restored(replace(plan, settings=PRESETS[preset], confirmed=recorder)):
             if restored.degradation is None or restored.degradation.deblur is None:
                 continue
-            changed, lost, ideal, power, misplaced, colour = recorder.asked[-1]
+            changed, lost, ideal, power, coded, misplaced, colour = recorder.asked[-1]
             gone = confirmation.removed(changed, lost + colour[0])
             before_db, valid_px = straight_db[restored.frame.index]
             yield {
@@ -173,7 +174,7 @@ def _promises(
                 "frame": restored.frame.index,
                 "removed": gone,
                 "misplaced": np.stack((*misplaced.errors(gone), misplaced.weight)).tolist(),
-                "regressors": confirmation.gain_regressors(ideal, power, recorder.left, colour[1]).tolist(),
+                "regressors": confirmation.gain_regressors(ideal, power, recorder.left, coded, colour[1]).tolist(),
                 "gain_db": _against_truth(truth, restored, valid_px) - before_db,
             }
 
@@ -203,7 +204,7 @@ def _promised_db(rows: Sequence[Row], coefficients: Array) -> Array:
 
 
 def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:
-    """Coefficients (4,) by robust least squares; none below 0 but the constant."""
+    """Coefficients (5,) by robust least squares; none below 0 but the constant."""
     gain_db = np.array([row["gain_db"] for row in rows])
     weight = 1 / np.sqrt([np.count_nonzero(captures == name) for name in captures])
     weight /= weight.mean()
@@ -211,7 +212,7 @@ def _fitted(rows: Sequence[Row], captures: NDArray[Any]) -> Array:
     def off(coefficients: Array) -> Array:
         return np.asarray((_promised_db(rows, coefficients) - gain_db) * weight)
 
-    bounds = ([-np.inf, 0, 0, 0], np.inf)
+    bounds = ([-np.inf, 0, 0, 0, 0], np.inf)
     return np.asarray(least_squares(off, confirmation.LEFT_OVER, bounds=bounds, loss="soft_l1", f_scale=OUTLYING_DB).x)
 
 

@@ -27,17 +27,20 @@ USUAL_SHARE, USUAL_SHARE_STD = 1.0, 0.5
 """Prior of the share: 1 for a correct restoration.  On 8 simulated captures, with exact profiles and with a phone's
 errors, it scattered by 0.3 between captures.  The prior is wider, so that wrong models are detected, while a few pairs
 that contradict each other still do not outweigh it."""
-LEFT_OVER = (1.45, 0.69, 0.34, 0.77)
+LEFT_OVER = (1.62, 0.69, 0.21, 0.21, 0.51)
 """Coefficients of the remaining squared error, grey levels squared.  Of ln of luma's over the sharp picture's power: a
-constant, and the slopes over ln of the spectra's ideal error over that power and over ln of the part that neighbours do
-not find restored; so a dimmer picture has as much less error.  Then that of the colour differences' ideal error, which
-a regression on the restored luma undercuts.
+constant, and the slopes over ln of the spectra's ideal error over that power, over ln of the part that neighbours do
+not find restored, and over ln of the coder's error over that power; so a dimmer picture has as much less error.  Then
+that of the colour differences' ideal error, which a regression on the restored luma undercuts.
+
+The coder's error counts beyond its noise: a coder drops the faint detail of a blurred picture and fills it in from
+other frames, so what is left there is not the blurred picture.
 
 Each predicts the error only to a factor.  ``python -m virest.app.bench --only fits`` fits the coefficients to pictures
-with ground truth: 1.45 ± 0.40, 0.77 ± 0.06, 0.32 ± 0.06, 1.14 ± 0.63 on 22 captures, median error 0.56 dB.  These are
-fitted to 16 captures of a second simulator too, and differ by at most 1.3 deviations."""
-LEFT_OVER_STD = 0.72
-"""Standard deviation of that logarithm, from the same benchmark."""
+with ground truth: 1.54 ± 0.48, 0.75 ± 0.09, 0.08 ± 0.15, 0.36 ± 0.12, 0.72 ± 0.54 on 22 captures, median error 0.52 dB.
+These are fitted to 36 captures of a second simulator too, and differ by at most 1.3 deviations."""
+LEFT_OVER_STD = 0.61
+"""Standard deviation of that logarithm, from the same 58 captures."""
 IN_PLACE = Misplaced()
 """No row displacement."""
 
@@ -74,20 +77,21 @@ class ConfirmedGain:
         lost: float,
         ideal: float,
         power: float,
+        coded: float,
         misplaced: Misplaced = IN_PLACE,
         colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
         """Gain, dB, of a restored picture, and its standard deviation.
 
         changed: mean square difference from the recorded picture; lost: that removed by the blur; ideal: an ideal
-        filter's error; power: the sharp picture's; the last three of luma, from the spectra, all in grey levels
-        squared.  misplaced: error by displaced rows.  colour: errors that an ideal filter removes from the colour
-        differences, and that it leaves.
+        filter's error; power: the sharp picture's; the last three of luma, from the spectra.  coded: the coder's error,
+        or the noise where the coder's step is unknown.  All in grey levels squared.  misplaced: error by displaced
+        rows.  colour: errors that an ideal filter removes from the colour differences, and that it leaves.
         The deviation combines the uncertainty of the remaining error (LEFT_OVER_STD), of the removed error (the scatter
         of the share, and the disagreement of ``changed`` and ``lost``), and of the rows' displacement.
         """
         lost += colour[0]
-        left = float(remaining_error(gain_regressors(ideal, power, self.left, colour[1]), np.array(LEFT_OVER)))
+        left = float(remaining_error(gain_regressors(ideal, power, self.left, coded, colour[1]), np.array(LEFT_OVER)))
         gone = removed(changed, lost)
         before, after = errors(left, gone, *misplaced.errors(gone))
         gains_db = 10 * np.log10(before / after)
@@ -113,16 +117,16 @@ def removed(changed: float, lost: float) -> float:
     return float(np.sqrt(changed * max(lost, 0.0)))
 
 
-def gain_regressors(ideal: float, power: float, left: float, colour: float) -> Array:
-    """(5,) the regressors of :data:`LEFT_OVER`, and the sharp picture's power."""
+def gain_regressors(ideal: float, power: float, left: float, coded: float, colour: float) -> Array:
+    """(6,) the regressors of :data:`LEFT_OVER`, and the sharp picture's power."""
     power = max(power, 1e-6)
-    return np.array([1.0, *np.log(np.maximum((ideal / power, left), 1e-6)), colour, power])
+    return np.array([1.0, *np.log(np.maximum((ideal / power, left, coded / power), 1e-6)), colour, power])
 
 
 def remaining_error(regressors: Array, coefficients: Array) -> Array:
-    """Squared error (...) that a restoration leaves, from regressors (..., 5) and :data:`LEFT_OVER`."""
-    luma, colour = np.exp(regressors[..., :3] @ coefficients[:3]), coefficients[3] * regressors[..., 3]
-    return np.asarray(regressors[..., 4] * luma + colour)
+    """Squared error (...) that a restoration leaves, from regressors (..., 6) and :data:`LEFT_OVER`."""
+    luma, colour = np.exp(regressors[..., :4] @ coefficients[:4]), coefficients[4] * regressors[..., 4]
+    return np.asarray(regressors[..., 5] * luma + colour)
 
 
 def _gain_db(part: float) -> float:

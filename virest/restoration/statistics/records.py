@@ -318,13 +318,18 @@ class PictureStatistics:
         return np.asarray(wrong.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
 
 
+def coded_variance(step: float) -> float:
+    """Mean square error, grey levels squared, of coefficients that a coder quantises with this step."""
+    return max(_CODER_SHARE * step**2, ROUNDING_POWER)
+
+
 def coder_noise(observed: Array, step: float) -> Array:
     """Coding noise (RINGS,) of a picture with power ``observed`` (RINGS,), from the step of the coder's quantiser.
 
     Power far above the step gets the quantiser's error; power far below it is dropped and is itself the error: reverse
     water-filling (Cover & Thomas 2006, section 10.3.3), smooth in between, since rings hold weak and strong places.
     """
-    level = max(_CODER_SHARE * step**2, ROUNDING_POWER)
+    level = coded_variance(step)
     falling = np.maximum(np.maximum.accumulate(observed[::-1])[::-1], ROUNDING_POWER)
     return np.asarray(level * falling / (level + falling))
 
