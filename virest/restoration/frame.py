@@ -44,7 +44,7 @@ from virest.restoration.shutter import perspective_map, rounded, rowwise_map, va
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, most_blurred, picture_statistics
 from virest.restoration.statistics.records import PictureStatistics, coded_variance
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
-from virest.restoration.taken_part import blurred_part, no_gain_reason, share_map, trusted_share
+from virest.restoration.taken_part import LEAST_CONFIRMED_DB, blurred_part, no_gain_reason, share_map, trusted_share
 from virest.restoration.undistortion import undistortion_map
 
 MIN_WARP_PX = 0.1
@@ -319,8 +319,10 @@ def _deblurred(
     restored = _blended(sharp, recorded, part)
     changed = 0.0 if confirmed is None else _mean_square(restored, recorded)
     details = _details(blur, settings, measured, joined, confirmed, changed)
-    if details.expected_gain_db is not None and details.expected_gain_db < 0:
-        return as_shown, None, (no_gain_reason(measured.luma_model, details.expected_gain_db),)
+    if details.expected_gain_db is not None:
+        why_not = no_gain_reason(measured.luma_model, details.expected_gain_db, LEAST_CONFIRMED_DB)
+        if why_not:
+            return as_shown, None, (why_not,)
     if unmasked is not None:  # unblurred regions keep the phone's sharpening
         restored = _blended(restored.__getitem__, as_shown, touched)
     return restored, details, ()

@@ -15,6 +15,11 @@ from virest.restoration.statistics.records import PictureStatistics
 
 MIN_GAIN_DB = 0.1
 """Do not deblur a frame with a lower expected gain: the expectation is that of an ideal filter."""
+LEAST_CONFIRMED_DB = 0.5
+"""Do not deblur a frame with a lower gain according to neighbours: half the predictions are off by more.
+
+Of 1052 frames of 58 simulated captures 79 have a lower prediction.  They gain 0.19 dB on average, and 9 of the 21
+frames that lose more than 0.1 dB are among them."""
 LEAST_SHARE, FULL_TRUST_DB = 0.7, 1.0
 """Weight of the restored picture at an expected gain of 0 dB, and gain, dB, at which the weight reaches 1."""
 SURE_GAIN_DB = 3.0
@@ -23,11 +28,11 @@ PART_STEP_PX = 80
 """Grid spacing of the minimum-blur test."""
 
 
-def no_gain_reason(luma: PictureStatistics, expected_db: float) -> str:
+def no_gain_reason(luma: PictureStatistics, expected_db: float, least_db: float = MIN_GAIN_DB) -> str:
     """Why the picture is not deblurred; empty: it is."""
     if not luma.measured:
         return "picture too small, or its blur too long, for its noise to be measured: not deblurred"
-    if expected_db < MIN_GAIN_DB:
+    if expected_db < least_db:
         return f"deblurring is expected to gain only {max(expected_db, 0.0):.2f} dB: not deblurred"
     return ""
 
