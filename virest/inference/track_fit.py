@@ -95,13 +95,9 @@ class TrackFit:
 
         Fits are comparable only at the same spread: a wrong plane gets a wide spread, which hides its residuals.
         """
-        left = self.difference_px / self.noise_px[:, None]
         if self.along_px is None:
             return self.distance
-        length, way = lengths_and_ways(self.along_px)
-        variance = 1 + (depth_spread_per_m * length / self.noise_px) ** 2
-        along = (left * way).sum(axis=-1)
-        return np.asarray(np.sqrt(np.maximum((left**2).sum(axis=-1) - along**2 * (1 - 1 / variance), 0.0)))
+        return _across_relief(self.difference_px, self.noise_px, self.along_px, depth_spread_per_m)
 
     def across_relief_px(self) -> Array:
         """Residuals (n, 2), px, reduced along the parallax by the points' spread of depths."""
@@ -222,6 +218,28 @@ def fit_from(
         coded = drawn_px(slopes, table.noise_px[table.pair], table.bits_per_px)
     moved = [_moved_by(evidence, system, inverse, errors) for errors in (coded, errors_px)]
     return _conclude(table, terms, system, inverse, bend, spread, blocks, (moved[0], np.linalg.norm(moved[1], axis=-1)))
+
+
+def unfitted(start: FitStart, depth_spread_per_m: float) -> Array:
+    """:meth:`TrackFit.distance_at` where nothing is fitted but the directions of travel: without covariances."""
+    evidence = TrackEvidence(start.imu, start.table, (), start.scene, start)
+    directed = isinstance(start.scene, DirectedMotion)
+    state = State(start.known, start.scene, np.zeros(0), ANY_DEPTH if directed else 0.0)
+    look = evidence.look(state, None, Slopes.HERE)
+    if directed or look.prediction.along_px is None:
+        return np.asarray(np.sqrt(evidence.weighed(state, look).squared))
+    difference_px = start.table.second_px - look.prediction.second_px
+    noise_px = start.table.noise_px[start.table.pair]
+    return _across_relief(difference_px, noise_px, look.prediction.along_px, depth_spread_per_m)
+
+
+def _across_relief(difference_px: Array, noise_px: Array, along_px: Array, depth_spread_per_m: float) -> Array:
+    """Whitened lengths (n,) of differences (n, 2), reduced along the parallax by the points' spread of depths."""
+    left = difference_px / noise_px[:, None]
+    length, way = lengths_and_ways(along_px)
+    variance = 1 + (depth_spread_per_m * length / noise_px) ** 2
+    along = (left * way).sum(axis=-1)
+    return np.asarray(np.sqrt(np.maximum((left**2).sum(axis=-1) - along**2 * (1 - 1 / variance), 0.0)))
 
 
 def _started(
