@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from fork_server import ForkServer
 
+from virest.app.machine import keep_freed_memory
+
 ROOT = Path(__file__).resolve().parent.parent
 RunVirest = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -32,10 +34,12 @@ def pytest_configure() -> None:
     """Give each of xdist's processes, and all that it starts, a core of its own: they are the parallelism already.
 
     A program that shares its work out over the cores it finds would start and load processes of its own in every test;
-    those that test this say so.  While tests are collected hardly anything becomes garbage.  Compiled code is kept even
-    where a machine says otherwise: each of the many programs that the tests start would compile the package anew.
+    those that test this say so.  Freed memory is kept, as the program does.  While tests are collected hardly anything
+    becomes garbage.  Compiled code is kept even where a machine says otherwise: each of the many programs that the
+    tests start would compile the package anew.
     """
     gc.disable()
+    keep_freed_memory()
     sys.dont_write_bytecode = False
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     worker = os.environ.get("PYTEST_XDIST_WORKER")

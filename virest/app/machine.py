@@ -47,6 +47,12 @@ def one_thread_each() -> None:
         os.environ[variable] = "1"
 
 
+def prepare_process() -> None:
+    """Set up a process that computes: one thread, and freed memory is kept."""
+    one_thread_each()
+    keep_freed_memory()
+
+
 def keep_freed_memory() -> bool:
     """Keep freed memory in this process, up to KEPT_BYTES; False if the C library has no such setting (not glibc).
 

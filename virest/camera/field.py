@@ -172,9 +172,9 @@ class Field:
 
 def interpolated(knots: tuple[float, ...], values: Array, covariate: Any, degree: int = 3) -> Array:
     """Spline through values (knots, ...) at a covariate of shape (...); constant beyond its ends."""
-    held = np.clip(np.asarray(covariate, float), knots[0], knots[-1])
+    held = np.minimum(np.maximum(np.asarray(covariate, float), knots[0]), knots[-1])
     cardinal = _cardinal(knots, degree)
-    along = np.tensordot(cardinal.c, values, axes=1)
+    along = cardinal.c @ values if values.ndim == 2 else np.tensordot(cardinal.c, values, axes=1)
     return np.asarray(BSpline.construct_fast(cardinal.t, along, cardinal.k)(held))
 
 

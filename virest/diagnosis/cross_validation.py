@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,10 +12,11 @@ from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
 from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, fit_model, relief_loss
 from virest.image_formation.point_model import TrackTable
+from virest.inference.fit_start import FitStart
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.parallel import ParallelMap
 from virest.inference.time_blocks import halves
-from virest.inference.track_fit import Term
+from virest.inference.track_fit import Term, fit_from
 
 JUDGE_POINTS = 3500
 """Points used to judge a cause; half of them fit it."""
@@ -94,8 +95,17 @@ def _descended(
         for lag, model in {c.model.lag: c.model for c, _ in starts}.items()
     }  # fmt: skip
     use = halves(evidence.block)
+    parts = {(lag, fold): table.chosen(use[fold][table.pair]) for lag, table in tables.items() for fold in FOLDS}
+    shared: dict[tuple[Hashable, ...], FitStart] = {}
+
+    def start(model: Model, fold: int) -> FitStart:
+        key = id(model.profile), id(model.scene), model.lag, fold
+        if key not in shared:
+            shared[key] = FitStart(evidence.imu, parts[model.lag, fold], model.profile, model.scene)
+        return shared[key]
+
     calls = [
-        (evidence.imu, tables[c.model.lag], models[fold], (*c.model.terms, *c.added), use[fold], iterations)
+        (start(models[fold], fold), models[fold], (*c.model.terms, *c.added), iterations)
         for c, models in starts
         for fold in FOLDS
     ]
@@ -107,10 +117,8 @@ Half = tuple[float, Model, float, float]
 """Loss, fitted model, scale and spread of depths of a candidate on the blocks of one fold."""
 
 
-def _screen(
-    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, iterations: int
-) -> Half:
-    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]), iterations, covariances=False)
+def _screen(start: FitStart, model: Model, terms: Sequence[Term], iterations: int) -> Half:
+    fitted = fit_from(start, terms, max_iterations=iterations, covariances=False)
     found = replace(model, profile=fitted.profile, scene=fitted.scene)
     return relief_loss(fitted), found, fitted.scale, fitted.depth_spread_per_m
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from virest.image_formation.point_model import TrackTable, centre, integrate_mot
 from virest.image_formation.row_clock import RowClock
 from virest.inference.comparable_noise import noise_distances
 from virest.inference.doubtful_log import STRAIGHT, STRAIGHT_PART, doubtful_stretches
+from virest.inference.fit_start import FitStart
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import CAUCHY, RAYLEIGH_MEDIAN
@@ -36,6 +37,8 @@ MAX_DEPTH_PULL, HELD_DEPTH_STD = 4.0, 1e-3
 HELD_DEPTH_STD), so that this depth is judged."""
 ITERATIONS = 10
 """Steps of a fit: half or twice as many change two simulated causes by less than 1e-8 of their values."""
+STARTS_KEPT = 4
+"""A search fits many causes to the two halves of the points from one or two models in turn."""
 MIN_SWAY_DEPTH_PER_M = 1e-4
 """Smallest inverse depth: that of the farthest scene (physical_limits.DEPTH_M)."""
 
@@ -61,6 +64,19 @@ class Evidence:
     """(pairs,) number of the time block."""
     break_s: Array
     """Times (breaks,) at which the path from the accelerometer is unknown, camera clock."""
+    _starts: dict[tuple[Hashable, ...], FitStart] = field(default_factory=dict, repr=False, compare=False)
+
+    def start(self, model: Model, part: Hashable, table: Callable[[], TrackTable]) -> FitStart:
+        """Where fits of a part of the points begin from a model; the last STARTS_KEPT are kept.
+
+        part: names the points, which ``table`` returns with the model's frame stamps.
+        """
+        key = id(model.profile), id(model.scene), model.lag, part
+        if key not in self._starts:
+            while len(self._starts) >= STARTS_KEPT:
+                self._starts.pop(next(iter(self._starts)))
+            self._starts[key] = FitStart(self.imu, table(), model.profile, model.scene)
+        return self._starts[key]
 
     def noise_px(self, fitted: TrackFit) -> float:
         """Tracking noise, px: capped residual rms per coordinate about a free smooth flow, without the camera model."""

@@ -236,27 +236,34 @@ def fit_steps(
     """
     u = np.linspace(-reach_px, reach_px, profiles.shape[1])
     centre, width = start or (np.zeros(len(profiles)), np.full(len(profiles), 0.25 * reach_px))
+    centred, jacobian = profiles - profiles.mean(axis=1, keepdims=True), np.ones((len(profiles), 4, len(u)))
     for _ in range(steps):
-        _, jacobian, residual = _step_model(u, profiles, centre, width)
-        normal = np.einsum("nim,njm->nij", jacobian, jacobian)
+        _, residual = _step_model(u, centred, centre, width, jacobian)
+        normal = jacobian @ jacobian.transpose(0, 2, 1)
         normal[:, range(4), range(4)] *= 1.0 + 1e-3
         normal[:, range(4), range(4)] += 1e-12
-        move = np.linalg.solve(normal, np.einsum("nim,nm->ni", jacobian, residual)[..., None])[..., 0]
+        move = np.linalg.solve(normal, jacobian @ residual[..., None])[..., 0]
         centre = np.clip(centre + np.clip(move[:, 2], -1.0, 1.0), -reach_px, reach_px)
         width = np.clip(width * np.exp(np.clip(move[:, 3] / width, -0.5, 0.5)), LEAST_WIDTH_PX, 2 * reach_px)
-    level, _, residual = _step_model(u, profiles, centre, width)
+    level, residual = _step_model(u, centred, centre, width)
     with np.errstate(divide="ignore", invalid="ignore"):
         misfit = np.where(level > 0, np.sqrt(np.mean(residual**2, axis=1)) / (2 * level), np.inf)
     return centre, width, misfit
 
 
-def _step_model(u: Array, profiles: Array, centre: Array, width: Array) -> tuple[Array, Array, Array]:
-    """(best b, derivatives (n, 4, m) with respect to a, b, u0 and s, residuals of the profiles)."""
+def _step_model(
+    u: Array, centred: Array, centre: Array, width: Array, jacobian: Array | None = None
+) -> tuple[Array, Array]:
+    """(best b, residuals of the profiles), profiles without their means.
+
+    jacobian: (n, 4, m) is filled with the derivatives with respect to a, b, u0 and s; that of a is 1 already.
+    """
     z = (u - centre[:, None]) / width[:, None]
     shape = erf(z / np.sqrt(2.0))
-    mean_shape, mean_profile = shape.mean(axis=1, keepdims=True), profiles.mean(axis=1, keepdims=True)
-    spread = ((shape - mean_shape) ** 2).sum(axis=1)
-    b = ((shape - mean_shape) * (profiles - mean_profile)).sum(axis=1) / np.maximum(spread, 1e-12)
-    residual = profiles - mean_profile - b[:, None] * (shape - mean_shape)
-    bell = np.sqrt(2 / np.pi) * np.exp(-0.5 * z**2) * (b / width)[:, None]
-    return b, np.stack([np.ones_like(shape), shape, -bell, -bell * z], axis=1), residual
+    away = shape - shape.mean(axis=1, keepdims=True)
+    b = np.einsum("nm,nm->n", away, centred) / np.maximum(np.einsum("nm,nm->n", away, away), 1e-12)
+    if jacobian is not None:
+        jacobian[:, 1] = shape
+        np.multiply(np.exp(-0.5 * z**2), (-np.sqrt(2 / np.pi) * b / width)[:, None], out=jacobian[:, 2])
+        np.multiply(jacobian[:, 2], z, out=jacobian[:, 3])
+    return b, centred - b[:, None] * away

@@ -13,6 +13,7 @@ A point's blurred image lies at the mean of its blur path, so R is the mean over
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -51,7 +52,7 @@ _PER_POINT = (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TrackTable:
     """All tracked points of all pairs in one table."""
 
@@ -92,6 +93,21 @@ class TrackTable:
         """Number of windows."""
         return len(self.origin_s)
 
+    @cached_property
+    def both_px(self) -> Array:
+        """(2 n, 2) the first points, then the second: one call for both costs little more than one for either."""
+        return np.concatenate([self.first_px, self.second_px])
+
+    @cached_property
+    def both_stamp_s(self) -> Array:
+        """(2 n,) their frames' timestamps."""
+        return np.concatenate([self.first_stamp_s, self.second_stamp_s])
+
+    @cached_property
+    def both_exposure_s(self) -> Array:
+        """(2 n,) their frames' exposures, as logged."""
+        return np.concatenate([self.first_exposure_s, self.second_exposure_s])
+
     def chosen(self, rows: Mask) -> TrackTable:
         """The table with some of its points; pairs keep their numbers."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _PER_POINT})
@@ -123,19 +139,37 @@ class Poses:
 
     trajectory: Trajectory
     exposure_scale: float
-    first_s: Array
-    """(n,) IMU clock."""
-    second_s: Array
-    first_exposure_s: Array
-    """(n,) around those times, over which motion is averaged."""
-    second_exposure_s: Array
+    both_s: Array
+    """(2 n,) IMU clock: the first observations, then the second."""
+    both_exposure_s: Array
+    """(2 n,) around those times, over which motion is averaged."""
     before: Orientations
     """At the first observation."""
     after: Orientations
     """At the second observation."""
 
+    @property
+    def first_s(self) -> Array:
+        """(n,) times of the first observations."""
+        return self.both_s[: len(self.both_s) // 2]
+
+    @property
+    def second_s(self) -> Array:
+        """(n,) times of the second observations."""
+        return self.both_s[len(self.both_s) // 2 :]
+
+    @property
+    def first_exposure_s(self) -> Array:
+        """(n,) exposures of the first observations."""
+        return self.both_exposure_s[: len(self.both_s) // 2]
+
+    @property
+    def second_exposure_s(self) -> Array:
+        """(n,) exposures of the second observations."""
+        return self.both_exposure_s[len(self.both_s) // 2 :]
+
     def again(self, lens: MovingLens, rays: Array) -> Array:
-        """Pixels (n, 2) of rays (n, 3), camera axes, at the second observation."""
+        """Pixels (..., n, 2) of rays (..., n, 3), camera axes, at the second observation."""
         return lens.project(rays, self.second_s, self.second_exposure_s)
 
 
@@ -274,23 +308,22 @@ def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sig
 
 def _lens_slope(lens: MovingLens, rays: Array, poses: Poses, expected: Array) -> Array:
     """Change (n, 2, 3) of pixels per unit of each part of rays (n, 3)."""
-    steps = (poses.again(lens, rays + RAY_STEP * axis) for axis in np.eye(3))
-    return np.stack([(step - expected) / RAY_STEP for step in steps], axis=-1)
+    steps = poses.again(lens, rays + RAY_STEP * np.eye(3)[:, None])
+    return np.ascontiguousarray(np.moveaxis((steps - expected) / RAY_STEP, 0, -1))
 
 
 def _poses(known: IntegratedMotion, table: TrackTable, like: Prediction | None) -> Poses:
     """Times and orientations of the points' observations; those of an earlier prediction if they are the same."""
     profile, scale = known.profile, known.profile.shutter.exposure_scale
-    first_s = seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s)
-    second_s = seen_s(profile, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    both_s = seen_s(profile, table.both_px, table.both_stamp_s, table.both_exposure_s)
     if like is not None:
         old = like.poses
         same = old.trajectory is known.trajectory and old.exposure_scale == scale
-        if same and np.array_equal(first_s, old.first_s) and np.array_equal(second_s, old.second_s):
+        if same and np.array_equal(both_s, old.both_s):
             return old
-    exposures = scale * table.first_exposure_s, scale * table.second_exposure_s
-    before, after = map(known.trajectory.mean_orientation, (first_s, second_s), exposures)
-    return Poses(known.trajectory, scale, first_s, second_s, *exposures, before, after)
+    exposure_s = scale * table.both_exposure_s
+    before, after = known.trajectory.mean_orientation(both_s, exposure_s).halves()
+    return Poses(known.trajectory, scale, both_s, exposure_s, before, after)
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,12 +367,10 @@ class Moved:
 
 def _paths(known: IntegratedMotion, table: TrackTable, scene: InertialMotion, poses: Poses) -> tuple[Paths, Paths]:
     assert known.displacement is not None
-    origin_s, window = np.asarray(known.profile.imu_time_s(table.origin_s)), table.window
-    first, second = (
-        Paths(time_s - origin_s[window], *known.displacement.at(time_s, origin_s, window))
-        for time_s in (poses.first_s, poses.second_s)
-    )
-    return first, second
+    origin_s, count = np.asarray(known.profile.imu_time_s(table.origin_s)), len(table)
+    window = np.concatenate([table.window, table.window])
+    found = (poses.both_s - origin_s[window], *known.displacement.at(poses.both_s, origin_s, window))
+    return Paths(*(part[:count] for part in found)), Paths(*(part[count:] for part in found))
 
 
 def _seen_again(known: IntegratedMotion, world: Array, poses: Poses, moved: Moved) -> Prediction:

@@ -7,15 +7,15 @@ import numpy as np
 from virest.arrays import Array, Index
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
+from virest.inference.fit_start import FitStart
 from virest.inference.robust import CAUCHY
-from virest.inference.track_fit import TrackFit, fit_tracks, for_table
+from virest.inference.track_fit import TrackFit, for_table, unfitted
 
 
 def distances(imu: ImuSamples, fitted: TrackFit, table: TrackTable, depth_spread_per_m: float) -> Array:
     """Whitened residual lengths (n,) of all points of a table for a fit that may have used only some of them."""
-    scene = for_table(fitted.scene, table)
-    everywhere = fit_tracks(imu, table, fitted.profile, (), scene, max_iterations=0, known=fitted.integrated)
-    return everywhere.distance_at(depth_spread_per_m)
+    start = FitStart(imu, table, fitted.profile, for_table(fitted.scene, table), fitted.integrated)
+    return unfitted(start, depth_spread_per_m)
 
 
 def loss(distance: Array, scale: float) -> Array:

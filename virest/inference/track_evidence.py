@@ -15,6 +15,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict, with_profile
 from virest.inference.descent import Slopes, System, slices
+from virest.inference.fit_start import FitStart
 from virest.inference.robust import CAUCHY, NORMAL_MEDIAN, RAYLEIGH_MEDIAN, cauchy_weight
 from virest.inference.term import Term, slopes_of
 from virest.inference.travel_direction import find_directions, without_directions
@@ -83,10 +84,14 @@ class TrackEvidence:
     table: TrackTable
     terms: tuple[Term, ...]
     start: Motion | None
+    shared: FitStart | None = None
+    """Keeps what other fits of these points need too."""
 
     def look(self, state: State, before: Linearisation | None, limit: Slopes) -> Linearisation:
         """Predict the points of a state, reusing the slopes of an earlier look while they are not stale."""
         table, scene = self.table, state.scene
+        if limit is Slopes.HERE and self.shared is not None and state.known is self.shared.known:
+            return self._shared_look(self.shared, state, None if before is None else before.prediction)
         like = None if before is None else before.prediction
         directed = isinstance(scene, DirectedMotion)
         if before is not None or directed:
@@ -107,14 +112,35 @@ class TrackEvidence:
         prediction = replace(prediction, slopes=None)
         return Linearisation(scene, prediction, np.concatenate(slopes, axis=-1), prediction.second_px, scene)
 
-    def _term_slopes(self, state: State, at: Prediction) -> Array:
-        """(n, 2, k) change of the predicted points per unit of each term's values."""
+    def _shared_look(self, shared: FitStart, state: State, like: Prediction | None) -> Linearisation:
+        """Predict the points where several fits begin; the prediction and each term's slopes are computed once."""
+        table, begun = self.table, state.scene
+        directed = isinstance(begun, DirectedMotion)
+
+        def seen() -> tuple[Prediction, Motion | None]:
+            moves = begun is not None and not directed
+            prediction = predict(state.known, table, begun, slopes=moves, like=like)
+            return _directed(table, prediction, begun) if isinstance(begun, DirectedMotion) else (prediction, begun)
+
+        prediction, scene = shared.seen(begun, seen)
+        base = replace(state, scene=None) if directed else state
+        slopes = [
+            shared.slopes(term, begun, lambda term=term: self._term_slopes(base, prediction, (term,)))  # type: ignore[misc]
+            for term in self.terms
+        ]
+        slopes += [] if prediction.slopes is None or self.start is None else [prediction.slopes]
+        slope = np.concatenate(slopes, axis=-1) if slopes else np.zeros((len(table), 2, 0))
+        prediction = replace(prediction, slopes=None)
+        return Linearisation(scene, prediction, slope, prediction.second_px, scene)
+
+    def _term_slopes(self, state: State, at: Prediction, terms: tuple[Term, ...] | None = None) -> Array:
+        """(n, 2, k) change of the predicted points per unit of each term's values; terms: None for all."""
 
         def moved_by(profile: CameraProfile) -> Array:
             moved = with_profile(state.known, self.imu, profile)
             return predict(moved, self.table, state.scene, like=at).second_px - at.second_px
 
-        found = [slopes_of(term, state.known.profile, self.table, moved_by) for term in self.terms]
+        found = [slopes_of(term, state.known.profile, self.table, moved_by) for term in terms or self.terms]
         return np.concatenate(found, axis=-1) if found else np.zeros((len(self.table), 2, 0))
 
     def weighed(self, state: State, look: Linearisation) -> TrackSystem:

@@ -17,10 +17,11 @@ from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.errors import ImuError
-from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, with_profile
+from virest.image_formation.point_model import IntegratedMotion, TrackTable
 from virest.inference.clustered import CovarianceModel, Index, adjusted_sums, scatter
 from virest.inference.coded_motion import DEVIATION, USUAL, drawn_px, step_slopes
 from virest.inference.descent import MAX_ITERATIONS, Slopes, descend, slices
+from virest.inference.fit_start import FitStart
 from virest.inference.profile_curvature import at_profile_minimum
 from virest.inference.robust import CAUCHY
 from virest.inference.term import Term
@@ -94,13 +95,9 @@ class TrackFit:
 
         Fits are comparable only at the same spread: a wrong plane gets a wide spread, which hides its residuals.
         """
-        left = self.difference_px / self.noise_px[:, None]
         if self.along_px is None:
             return self.distance
-        length, way = lengths_and_ways(self.along_px)
-        variance = 1 + (depth_spread_per_m * length / self.noise_px) ** 2
-        along = (left * way).sum(axis=-1)
-        return np.asarray(np.sqrt(np.maximum((left**2).sum(axis=-1) - along**2 * (1 - 1 / variance), 0.0)))
+        return _across_relief(self.difference_px, self.noise_px, self.along_px, depth_spread_per_m)
 
     def across_relief_px(self) -> Array:
         """Residuals (n, 2), px, reduced along the parallax by the points' spread of depths."""
@@ -181,19 +178,28 @@ def fit_tracks(
     covariances: False skips re-evaluating the final slopes: values and residuals are the same, covariances are coarse.
     errors_px (m, n, 2): errors common to all points, independent of each other, of one standard deviation each.
     """
-    terms = tuple(terms)
-    inertial = isinstance(scene, InertialMotion)
-    if known is None or (inertial and known.displacement is None):
-        known = integrate_motion(imu, profile, translation=inertial)
-    known = with_profile(known, imu, profile)
+    start = FitStart(imu, table, profile, scene, known)
+    return fit_from(start, terms, blocks, max_iterations, covariances, errors_px)
+
+
+def fit_from(
+    start: FitStart,
+    terms: Sequence[Term],
+    blocks: int = 12,
+    max_iterations: int = MAX_ITERATIONS,
+    covariances: bool = True,
+    errors_px: Array | None = None,
+) -> TrackFit:
+    """:func:`fit_tracks` from a start that several fits may share."""
+    terms, table, scene, known = tuple(terms), start.table, start.scene, start.known
+    inertial, directed = isinstance(scene, InertialMotion), isinstance(scene, DirectedMotion)
     if inertial and known.displacement is None:
         raise ImuError("no accelerometer to determine the camera's path", hint="fit a free motion")
-    directed = isinstance(scene, DirectedMotion)
     state = State(known, scene, np.zeros(sum(map(len, terms))), ANY_DEPTH if directed else 0.0)
-    evidence = TrackEvidence(imu, table, terms, scene)
+    evidence = TrackEvidence(start.imu, table, terms, scene, start)
     look: Linearisation | None = None
     if isinstance(scene, InertialMotion) and max_iterations and not scene.velocity_m_s.any():
-        state, look = _started(evidence, state, scene)
+        state, look = _started(evidence, start, state, scene)
     for _ in range(SPREAD_PASSES if inertial else 1):
         system = descend(evidence, state, max_iterations, look, covariances)
         spread, look = evidence.depth_spread(system), system.look
@@ -214,10 +220,35 @@ def fit_tracks(
     return _conclude(table, terms, system, inverse, bend, spread, blocks, (moved[0], np.linalg.norm(moved[1], axis=-1)))
 
 
-def _started(evidence: TrackEvidence, rest: State, scene: InertialMotion) -> tuple[State, Linearisation]:
+def unfitted(start: FitStart, depth_spread_per_m: float) -> Array:
+    """:meth:`TrackFit.distance_at` where nothing is fitted but the directions of travel: without covariances."""
+    evidence = TrackEvidence(start.imu, start.table, (), start.scene, start)
+    directed = isinstance(start.scene, DirectedMotion)
+    state = State(start.known, start.scene, np.zeros(0), ANY_DEPTH if directed else 0.0)
+    look = evidence.look(state, None, Slopes.HERE)
+    if directed or look.prediction.along_px is None:
+        return np.asarray(np.sqrt(evidence.weighed(state, look).squared))
+    difference_px = start.table.second_px - look.prediction.second_px
+    noise_px = start.table.noise_px[start.table.pair]
+    return _across_relief(difference_px, noise_px, look.prediction.along_px, depth_spread_per_m)
+
+
+def _across_relief(difference_px: Array, noise_px: Array, along_px: Array, depth_spread_per_m: float) -> Array:
+    """Whitened lengths (n,) of differences (n, 2), reduced along the parallax by the points' spread of depths."""
+    left = difference_px / noise_px[:, None]
+    length, way = lengths_and_ways(along_px)
+    variance = 1 + (depth_spread_per_m * length / noise_px) ** 2
+    along = (left * way).sum(axis=-1)
+    return np.asarray(np.sqrt(np.maximum((left**2).sum(axis=-1) - along**2 * (1 - 1 / variance), 0.0)))
+
+
+def _started(
+    evidence: TrackEvidence, start: FitStart, rest: State, scene: InertialMotion
+) -> tuple[State, Linearisation]:
     """The linear start of a scene at rest, or rest where that fits better; and its linearisation."""
     look = evidence.look(rest, None, Slopes.HERE)
-    moving = replace(rest, scene=linear_start(rest.known, evidence.table, look.prediction, scene))
+    way = start.moving(lambda: linear_start(rest.known, evidence.table, look.prediction, scene))
+    moving = replace(rest, scene=way)
     ahead = evidence.look(moving, look, Slopes.HERE)
     at_rest, travelling = evidence.weighed(rest, look), evidence.weighed(moving, ahead)
     better = travelling.cost(at_rest.scale) < at_rest.cost(at_rest.scale)

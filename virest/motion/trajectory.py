@@ -66,8 +66,8 @@ class Trajectory:
 
     def _locate(self, time_s: Array) -> tuple[Index, Array]:
         """Interval of each time (...), and the seconds since its knot (...). Times beyond the knots are clipped."""
-        held = np.clip(time_s, self.time_s[0], self.time_s[-1])
-        interval = np.clip(np.searchsorted(self.time_s, held, side="right") - 1, 0, len(self.time_s) - 2)
+        held = np.minimum(np.maximum(time_s, self.time_s[0]), self.time_s[-1])
+        interval = np.minimum(np.maximum(self.time_s.searchsorted(held, "right") - 1, 0), len(self.time_s) - 2)
         return interval, held - self.time_s[interval]
 
 
@@ -79,6 +79,12 @@ class Orientations:
     """(n, 3, 3)."""
     since: Array
     """(n, 3, 3)."""
+
+    def halves(self) -> tuple[Orientations, Orientations]:
+        """Those at the first n / 2 times, and those at the others."""
+        middle = len(self.knot) // 2
+        first, second = slice(middle), slice(middle, None)
+        return Orientations(self.knot[first], self.since[first]), Orientations(self.knot[second], self.since[second])
 
     def to_world(self, rays: Array) -> Array:
         """Rays (n, 3) from camera to world axes."""

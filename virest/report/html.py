@@ -267,7 +267,7 @@ def shown(value: Any) -> Any:
     """Text for display: tabs and line breaks as blanks, other unprintable characters by their code."""
     if value is None:
         return "–"
-    if not isinstance(value, str) or isinstance(value, Markup):
+    if not isinstance(value, str) or isinstance(value, Markup) or value.isprintable():
         return value
     return "".join(c if c.isprintable() else " " if c in "\t\n\r" else f"\\u{ord(c):04x}" for c in value)
 

@@ -9,7 +9,7 @@ import typer
 
 from virest.app import console
 from virest.app.cli.options import Config, Json, OneCapture, Quiet, Verbose, Version, emit_facts, one_capture
-from virest.app.machine import cores, one_thread_each
+from virest.app.machine import cores, prepare_process
 
 CALIBRATED_EXTRAS = (
     "focal",
@@ -59,7 +59,7 @@ def calibrate(
     $ virest calibrate shaken --json --out found.yaml | jq '.values[] | select(.determined) | .name, .value, .std'
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
-    one_thread_each()
+    prepare_process()
     from virest.app.calibrate import CalibrationOutput, plan_calibration, run_calibration
     from virest.app.process_map import process_map
 

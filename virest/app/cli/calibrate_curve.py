@@ -9,7 +9,7 @@ import typer
 
 from virest.app import console
 from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, one_of
-from virest.app.machine import one_thread_each
+from virest.app.machine import prepare_process
 
 CURVE_KINDS = ("auto", "linear", "five_segment", "gamma", "srgb", "table")
 
@@ -50,7 +50,7 @@ def calibrate_curve(
     $ virest calibrate-curve stills --exposures stills/exposures.csv
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
-    one_thread_each()
+    prepare_process()
     from virest.app.calibrate_curve import calibrate_curve as fit_and_write
     from virest.app.calibrate_curve import plot_format_known
 

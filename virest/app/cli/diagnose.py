@@ -9,7 +9,7 @@ import typer
 
 from virest.app import console
 from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts, on_bar
-from virest.app.machine import cores, one_thread_each
+from virest.app.machine import cores, prepare_process
 
 
 def diagnose(
@@ -39,7 +39,7 @@ def diagnose(
     $ virest process trip --config virest-out/trip/extended.yaml --out better
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
-    one_thread_each()
+    prepare_process()
     from virest.app.diagnose import DiagnosisOptions, run_diagnosis
     from virest.app.process_map import process_map
 

@@ -20,7 +20,7 @@ from virest.app.cli.options import (
     one_of,
     parse_frames,
 )
-from virest.app.machine import one_thread_each
+from virest.app.machine import prepare_process
 
 BOARDS = ("auto", "chessboard", "aprilgrid")
 
@@ -74,7 +74,7 @@ def shutter(
         return 0
     _require_captures(paths, {"--config": config, "--frames": frames})
     chosen = parse_frames(frames)
-    one_thread_each()
+    prepare_process()
     from virest.app.evaluate_shutter import ShutterOptions, run_shutter
 
     options = ShutterOptions(tuple(paths), config, chosen, board, out, quick)
@@ -131,7 +131,7 @@ def deblur(
         raise typer.BadParameter("give captures, or --restored and --reference, not both")
     _require_captures(paths, {"--config": config, "--frames": frames})
     chosen = parse_frames(frames)
-    one_thread_each()
+    prepare_process()
     from virest.app.evaluate_deblur import DeblurOptions, run_deblur
 
     options = DeblurOptions(tuple(paths), config, chosen, restored, reference, out, quick, over_time)

@@ -9,7 +9,7 @@ import typer
 
 from virest.app import console
 from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts, on_bar, one_of
-from virest.app.machine import one_thread_each
+from virest.app.machine import prepare_process
 from virest.restoration.settings import PRESETS
 
 
@@ -63,7 +63,7 @@ def slam(
         return 0
     if paths and devices:
         raise typer.BadParameter("--devices simulates its captures; give no CAPTURE with it")
-    one_thread_each()
+    prepare_process()
     from virest.app.evaluate_slam import SlamOptions, run_slam
 
     options = SlamOptions(command, seeds, devices, quick, out, preset, timeout_s)

@@ -9,7 +9,7 @@ import typer
 
 from virest.app import console
 from virest.app.cli.options import Config, Json, Quiet, Verbose, Version, emit_facts, one_of
-from virest.app.machine import one_thread_each
+from virest.app.machine import prepare_process
 from virest.restoration.settings import PRESETS
 
 
@@ -38,7 +38,7 @@ def preview(
     wrote text-preview.png
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
-    one_thread_each()
+    prepare_process()
     from virest.app.preview import PreviewOptions, run_preview
 
     options = PreviewOptions(out, config, frame, preset, overwrite)

@@ -25,7 +25,7 @@ from virest.app.cli.options import (
     parse_neighbours,
     parse_shard,
 )
-from virest.app.machine import cores, one_thread_each
+from virest.app.machine import cores, prepare_process
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS
 
 
@@ -134,7 +134,7 @@ def process(
         return 0
     if video is not None and len(paths) > 1 and "{capture}" not in video:
         raise typer.BadParameter("--video: several captures need {capture} in the file name")
-    one_thread_each()
+    prepare_process()
     from virest.app.finish import FinishOptions
     from virest.app.process import ProcessOptions, process_captures
     from virest.app.segments import PictureOptions

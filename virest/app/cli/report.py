@@ -9,7 +9,7 @@ import typer
 
 from virest.app import console
 from virest.app.cli.options import Json, Quiet, Verbose, Version, emit_facts
-from virest.app.machine import one_thread_each
+from virest.app.machine import prepare_process
 
 
 def report(
@@ -47,7 +47,7 @@ def report(
     $ virest report virest-out --json | jq -r '.captures[] | select(.counts.failed > 0) | .capture'
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
-    one_thread_each()
+    prepare_process()
     from virest.app.report import ReportOptions, write_report
 
     outcome = write_report(run_dir, ReportOptions(out, frames, capture, overwrite))

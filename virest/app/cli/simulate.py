@@ -26,7 +26,7 @@ from virest.app.cli.phone_options import (
     Tone,
     one_or_two,
 )
-from virest.app.machine import one_thread_each
+from virest.app.machine import prepare_process
 from virest.restoration.settings import REFERENCES
 
 DIRECTIONS = ("top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left")
@@ -162,7 +162,7 @@ def simulate(
     auto_exposure_ev, auto_exposure_steps = _parse_auto_exposure(auto_exposure)
     amount, radius_px = one_or_two("--sharpen", sharpen)
     rest, rest_cutoff_hz = one_or_two("--stabiliser-rest", stabiliser_rest)
-    one_thread_each()
+    prepare_process()
     from virest.app.simulate import simulate_command
     from virest.camera.profile_file import read_profile
     from virest.simulation.phone_isp import make_isp
@@ -192,7 +192,7 @@ def _simulate_like(
 ) -> dict[str, Any]:
     """Re-create a capture; a single number N in ``--frames`` means its first N frames."""
     chosen = parse_frames(frames if frames is None or ":" in frames else f":{frames}")
-    one_thread_each()
+    prepare_process()
     from virest.app.recreate import count_frames, simulate_like
 
     with console.progress_bar(count_frames(like, chosen), "simulate", quiet=quiet) as bar:

@@ -31,7 +31,7 @@ from virest.diagnosis.field.screening import (
     select,
 )
 from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
-from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, distances, fit_model, loss
+from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
     EXCESS_SCALE,
     FINAL_POINTS,
@@ -44,7 +44,7 @@ from virest.diagnosis.geometric_ladder import (
 )
 from virest.diagnosis.structure import STRUCTURE_NOISES
 from virest.inference.chance import beyond_noise, t_ratio
-from virest.inference.track_fit import Term, TrackFit
+from virest.inference.track_fit import Term, TrackFit, fit_from
 
 log = logging.getLogger(__name__)
 
@@ -433,7 +433,9 @@ def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool
     fold = (np.arange(len(table)) if by_point else block) % 2
     left = np.zeros(len(table))
     for number in (0, 1):
-        part = fit_model(evidence.imu, model, model.terms, table.chosen(fold == number), covariances=False)
+        half = (JUDGE_POINTS, by_point, number)
+        start = evidence.start(model, half, lambda number=number: table.chosen(fold == number))  # type: ignore[misc]
+        part = fit_from(start, model.terms, max_iterations=ITERATIONS, covariances=False)
         left[fold != number] = distances(evidence.imu, part, table, scaled.depth_spread_per_m)[fold != number]
     return HeldOut(np.asarray(loss(left, 1.0)), None if by_point else block, capped_rms(left))
 
