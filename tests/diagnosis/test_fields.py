@@ -191,8 +191,22 @@ def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:
     nominal = replace(phone.profile, depth_m=None)
     _, fields = judged(phone, nominal)
     assert [field.covariates for field in fields] == [("acceleration",)]
-    found = np.array([field.at(1.0)[..., :] for field in fields[0].fields])
+    found = np.array([(field.at(1.0) - field.at(-1.0)) / 2 for field in fields[0].fields])
     assert np.corrcoef(found.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
+
+
+def test_a_bias_measured_at_rest_stays_beside_a_sensitivity_to_gravity() -> None:
+    """Gravity is in a bias that was measured in the same pose; the field's rate at no force takes it out again."""
+    wall = replace(HAND, seed=76, sway_m=0.05, plane_per_m=(0.05, -0.1, 0.6), accel_bias_m_s2=(0.0, 0.0, 0.0))
+    phone = StrangePhone(
+        wall, Strange(gyro=lambda t, reading, force: reading + (force - force.mean(axis=0)) @ PER_FORCE.T)
+    )
+    verdict, (field,) = judged(phone, replace(phone.profile, depth_m=None))
+    assert not verdict.accepted
+    assert field.covariates == ("acceleration",)
+    assert field.size == pytest.approx(float(np.linalg.norm(PER_FORCE, axis=0).max()), rel=0.15)
+    sensitivity = np.array([(f.at(1.0) - f.at(-1.0)) / 2 for f in field.fields])
+    assert np.corrcoef(sensitivity.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
 
 
 @pytest.mark.parametrize(("seed", "sway_m"), [(101, 0.1), (102, 0.25)], ids=["shaken", "at_4_g"])

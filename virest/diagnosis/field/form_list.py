@@ -72,7 +72,7 @@ def possible_forms(
         forms.append(focus)
     forms += [_rate_form(capture.imu, profile), _fine_rate_form(capture.imu, profile, known)]
     if capture.imu.has_accelerometer:
-        forms.append(_force_form())
+        forms.append(_force_form(known))
     return forms
 
 
@@ -313,8 +313,17 @@ def _over_rates(
     return FieldForm(tuple(fields), block_diag(*bases))
 
 
-def _force_form() -> FieldForm:
-    """Rates proportional to the specific force: 3 × 3 numbers, as values at FORCE_REACH_M_S2."""
+def _force_form(known: frozenset[str]) -> FieldForm:
+    """Rates linear in the specific force: 3 × 3 numbers, as values at FORCE_REACH_M_S2, and 3 at no force.
+
+    A bias measured at rest includes what gravity adds in that pose, so the rates at no force are the field's, unless
+    the bias is in the model.
+    """
     fields = tuple(_zero("rate", (name,), [np.array([-FORCE_REACH_M_S2, FORCE_REACH_M_S2])]) for name in FORCES)
-    odd = np.array([[-1.0], [1.0]]) / np.sqrt(2)
-    return FieldForm(fields, block_diag(*[np.kron(odd, np.eye(3))] * 3))
+    odd, even = np.array([[-1.0], [1.0]]) / np.sqrt(2), np.ones((2, 1)) / np.sqrt(2)
+    basis = np.asarray(block_diag(*[np.kron(odd, np.eye(3))] * 3))
+    if "gyro_bias" not in known:
+        at_no_force = np.zeros((len(basis), 3))
+        at_no_force[:6] = np.kron(even, np.eye(3))
+        basis = np.concatenate([basis, at_no_force], axis=1)
+    return FieldForm(fields, basis, build=lambda _profile, now: _force_form(now))
