@@ -225,6 +225,19 @@ def test_a_wrong_focal_length_beside_it_keeps_its_name(seed: int, sway_m: float)
     assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
 
 
+def test_a_bias_that_changes_at_an_instant_is_a_step() -> None:
+    """A curve through knots overshot at it: ten times the change, and a verdict that left most unexplained."""
+    change = np.array([0.02, -0.015, 0.01])
+    phone = StrangePhone(
+        HAND, Strange(gyro=lambda t, reading, force: reading + np.where(t >= 1.13, 1.0, 0.0)[:, None] * change)
+    )
+    verdict, (field,) = judged(phone, phone.profile)
+    assert (field.kind, field.covariates, field.shape) == ("rate", ("time",), "a step")
+    assert field.fields[0].knots[0][0] == pytest.approx(1.13, abs=0.02)
+    assert np.array(field.fields[0].values)[-1] == pytest.approx(-change, abs=0.002)
+    assert verdict.final_rms_px < 1.1 * HAND.noise_px
+
+
 def test_a_filled_gap_is_bridged_from_the_points() -> None:
     """A straight line in the log is seen in the log, confirmed by the points, and replaced by what they tell."""
     phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=filled(1.0, 1.15)))

@@ -65,7 +65,7 @@ def possible_forms(
     drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
     places = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), _off_centre_form(profile)]
     forms = [*places, *drifts]
-    forms += step_forms(capture, _candidate_steps_s(span_s, capture))
+    forms += step_forms(capture, candidate_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms += [_row_form(count) for count in (ROW_KNOTS, FINE_ROW_KNOTS)]
     if (focus := _focus_form(capture)) is not None:
@@ -236,14 +236,15 @@ def _drift_form(
     return FieldForm((field,), free, local=local, build=again(knots), refine=refine)
 
 
-def step_forms(capture: Capture, at_s: Array) -> list[FieldForm]:
-    """A sudden change of the focal length, one form for each instant (n,)."""
+def step_forms(capture: Capture, at_s: Array, kind: str = "scale") -> list[FieldForm]:
+    """A sudden change of the focal length, or of the gyroscope's bias (kind ``rate``): one form per instant (n,)."""
     edges = [np.array([t - STEP_EDGE_S / 2, t + STEP_EDGE_S / 2]) for t in at_s]
-    fields = [_zero("scale", (TIME,), [edge], capture.stamp_0_ns) for edge in edges]
-    return [FieldForm((f,), np.array([[0.0], [1.0]]), float(t)) for f, t in zip(fields, at_s, strict=True)]
+    fields = [_zero(kind, (TIME,), [edge], capture.stamp_0_ns) for edge in edges]
+    later = np.kron(np.array([[0.0], [1.0]]), np.eye(KINDS[kind][1]))
+    return [FieldForm((f,), later, float(t)) for f, t in zip(fields, at_s, strict=True)]
 
 
-def _candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
+def candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
     """Instants at which a sudden change is searched for."""
     frames = sum(span_s[0] <= frame.time_s <= span_s[1] for frame in capture.frames)
     return np.linspace(*span_s, min(frames // FRAMES_PER_STEP, MOST_STEPS) + 2)[1:-1]

@@ -106,7 +106,7 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "turn the phone on a table by a known angle, again and again from a cold start",
     ),
     ("rate", ("time",)): Pattern(
-        "the gyroscope's bias changes by up to {size} over the capture",
+        "the gyroscope's bias changes by up to {size} over the capture, {shape} of time",
         "the sensor warms up, or the phone corrects its bias while it logs",
         "log the phone at rest for ten minutes from a cold start",
     ),
