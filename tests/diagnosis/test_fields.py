@@ -16,6 +16,7 @@ from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.capture.profile_source import focus_log
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.records import Distrusted
@@ -180,6 +181,17 @@ def test_a_lens_that_breathes_runs_along_the_focus_and_names_time_as_its_rival()
     assert "scale over time would explain it equally well" in field.sentence
     assert field.size == pytest.approx(0.04, rel=0.1)
     assert not field.fields[0].belongs_to_one_capture
+
+
+def test_a_lens_goes_on_focusing_while_the_last_frame_is_read() -> None:
+    """Held at its last value, the log bent the last pair, which a curve over time then explained in its place."""
+    dioptres = Strange(focus_dioptres=lambda t: 0.5 + 0.3 * t)
+    capture = StrangePhone(HAND, dioptres).capture
+    times, values = np.array(focus_log(capture))
+    last_s = capture.frames[-1].time_s
+    assert times[-1] > last_s + 0.03
+    assert np.interp(last_s + 0.02, times, values) == pytest.approx(0.5 + 0.3 * (last_s + 0.02))
+    assert focus_log(StrangePhone(HAND, Strange()).capture) is None
 
 
 def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:

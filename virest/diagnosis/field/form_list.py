@@ -17,6 +17,7 @@ from virest.arrays import Array
 from virest.camera.field import FORCES, KINDS, RATES, Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.capture.profile_source import focus_log
 from virest.capture.records import Capture
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
 
@@ -252,13 +253,14 @@ def candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
 
 def _focus_form(capture: Capture) -> FieldForm | None:
     """Over the logged focus distance, relative to the start of the capture."""
-    log = [(f.time_s, f.focus_dioptres) for f in capture.frames if f.focus_dioptres is not None]
-    values = np.array([value for _, value in log])
-    if len(log) < 0.5 * len(capture.frames) or np.ptp(values) < LEAST_FOCUS_CHANGE:
+    log = focus_log(capture)
+    if log is None or len(log[0]) < 0.5 * len(capture.frames):
+        return None
+    values = np.array(log[1])
+    if np.ptp(values) < LEAST_FOCUS_CHANGE:
         return None
     knots: Array = np.unique(np.round(np.linspace(values.min(), values.max(), FOCUS_KNOTS), 6))
-    times = tuple(float(time_s) for time_s, _ in log)
-    field = _zero("scale", ("focus",), [knots], None, (times, tuple(values.tolist())))
+    field = _zero("scale", ("focus",), [knots], None, log)
     return FieldForm((field,), null_space(cardinal_weights(field.knots[0], values[0])[None]))
 
 
