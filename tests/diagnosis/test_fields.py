@@ -16,6 +16,7 @@ from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.capture.profile_source import focus_log
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.records import Distrusted
@@ -182,6 +183,17 @@ def test_a_lens_that_breathes_runs_along_the_focus_and_names_time_as_its_rival()
     assert not field.fields[0].belongs_to_one_capture
 
 
+def test_a_lens_goes_on_focusing_while_the_last_frame_is_read() -> None:
+    """Held at its last value, the log bent the last pair, which a curve over time then explained in its place."""
+    dioptres = Strange(focus_dioptres=lambda t: 0.5 + 0.3 * t)
+    capture = StrangePhone(HAND, dioptres).capture
+    times, values = np.array(focus_log(capture))
+    last_s = capture.frames[-1].time_s
+    assert times[-1] > last_s + 0.03
+    assert np.interp(last_s + 0.02, times, values) == pytest.approx(0.5 + 0.3 * (last_s + 0.02))
+    assert focus_log(StrangePhone(HAND, Strange()).capture) is None
+
+
 def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:
     """The nine numbers come back with their signs."""
     wall = replace(
@@ -191,8 +203,22 @@ def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:
     nominal = replace(phone.profile, depth_m=None)
     _, fields = judged(phone, nominal)
     assert [field.covariates for field in fields] == [("acceleration",)]
-    found = np.array([field.at(1.0)[..., :] for field in fields[0].fields])
+    found = np.array([(field.at(1.0) - field.at(-1.0)) / 2 for field in fields[0].fields])
     assert np.corrcoef(found.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
+
+
+def test_a_bias_measured_at_rest_stays_beside_a_sensitivity_to_gravity() -> None:
+    """Gravity is in a bias that was measured in the same pose; the field's rate at no force takes it out again."""
+    wall = replace(HAND, seed=76, sway_m=0.05, plane_per_m=(0.05, -0.1, 0.6), accel_bias_m_s2=(0.0, 0.0, 0.0))
+    phone = StrangePhone(
+        wall, Strange(gyro=lambda t, reading, force: reading + (force - force.mean(axis=0)) @ PER_FORCE.T)
+    )
+    verdict, (field,) = judged(phone, replace(phone.profile, depth_m=None))
+    assert not verdict.accepted
+    assert field.covariates == ("acceleration",)
+    assert field.size == pytest.approx(float(np.linalg.norm(PER_FORCE, axis=0).max()), rel=0.15)
+    sensitivity = np.array([(f.at(1.0) - f.at(-1.0)) / 2 for f in field.fields])
+    assert np.corrcoef(sensitivity.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
 
 
 @pytest.mark.parametrize(("seed", "sway_m"), [(101, 0.1), (102, 0.25)], ids=["shaken", "at_4_g"])
@@ -209,6 +235,19 @@ def test_a_wrong_focal_length_beside_it_keeps_its_name(seed: int, sway_m: float)
     assert verdict.model.profile.intrinsics.fx_px == pytest.approx(lens.fx_px, rel=1e-3)
     assert [field.covariates for field in fields] == [("acceleration",)]
     assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+
+
+def test_a_bias_that_changes_at_an_instant_is_a_step() -> None:
+    """A curve through knots overshot at it: ten times the change, and a verdict that left most unexplained."""
+    change = np.array([0.02, -0.015, 0.01])
+    phone = StrangePhone(
+        HAND, Strange(gyro=lambda t, reading, force: reading + np.where(t >= 1.13, 1.0, 0.0)[:, None] * change)
+    )
+    verdict, (field,) = judged(phone, phone.profile)
+    assert (field.kind, field.covariates, field.shape) == ("rate", ("time",), "a step")
+    assert field.fields[0].knots[0][0] == pytest.approx(1.13, abs=0.02)
+    assert np.array(field.fields[0].values)[-1] == pytest.approx(-change, abs=0.002)
+    assert verdict.final_rms_px < 1.1 * HAND.noise_px
 
 
 def test_a_filled_gap_is_bridged_from_the_points() -> None:

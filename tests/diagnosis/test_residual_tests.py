@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from motion.synthetic_tracks import Recording, Setup
 
+from virest.diagnosis.findings import Remaining
 from virest.diagnosis.geometric_evidence import make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.ladder import MOST_TRAVEL_PX, travel_blur_px
 from virest.diagnosis.residual_tests import points_left
+from virest.inference.blur_bias import blur_bias_px
 
 WALL = Setup(
     seed=71, frames=31, points=40, velocity_m_s=(0.1, -0.05, 0.8), plane_per_m=(0.05, -0.1, 0.6), noise_px=0.08
@@ -63,6 +65,27 @@ def test_what_may_be_chance_is_no_fault(before_a_wall: GeometricVerdict) -> None
     """A residual above the noise that pairs of frames do not bear out is not called unexplained."""
     found = points_left(replace(before_a_wall, noise_px=0.08, final_rms_px=0.13))
     assert not found.significant
+
+
+def test_what_differently_blurred_frames_do_to_the_tracker_is_no_fault() -> None:
+    """Points of a pair are off together, as both frames' blur paths predict; as much the other way is a fault."""
+    recording = Recording(replace(WALL, velocity_m_s=(0.0, 0.0, 0.0), rate_rad_s=1.2, noise_px=0.1))
+    imu = recording.imu.between(-0.2, recording.stamp_s[-1] + 0.25)
+    evidence = make_evidence(imu, recording.observed)
+    verdict = climb(evidence, replace(recording.profile, depth_m=np.inf), (), (), max_rungs=0)
+    verdict = replace(verdict, evidence=evidence)
+    blurred = np.full(len(verdict.table), 0.024)
+    table = replace(verdict.table, first_exposure_s=blurred, second_exposure_s=blurred)
+    guided = np.zeros(len(evidence.observed.pairs), bool)
+    bias_px = blur_bias_px(verdict.fit.integrated, table, guided)
+    assert np.sqrt(np.mean(bias_px**2)) > 0.05
+
+    def left(part: float) -> Remaining:
+        off = verdict.fit.difference_px + part * bias_px
+        return points_left(replace(verdict, table=table, fit=replace(verdict.fit, difference_px=off)))
+
+    assert not left(1.3).significant
+    assert left(-1.3).significant
 
 
 def exposed_for(verdict: GeometricVerdict, exposure_s: float) -> GeometricVerdict:

@@ -68,12 +68,28 @@ def fill_from_metadata(profile: CameraProfile, capture: Capture) -> CameraProfil
     return profile
 
 
+def focus_log(capture: Capture) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """Times, camera clock, and dioptres of the logged focus distance; None without a log.
+
+    The rows of the last frame are read up to a frame period after its timestamp, while the lens goes on moving: the log
+    is extended by a period along its last two values.
+    """
+    known = [(frame.time_s, frame.focus_dioptres) for frame in capture.frames if frame.focus_dioptres is not None]
+    if not known:
+        return None
+    times, values = (list(column) for column in zip(*known, strict=True))
+    if len(known) > 1:
+        times.append(2 * times[-1] - times[-2])
+        values.append(2 * values[-1] - values[-2])
+    return tuple(map(float, times)), tuple(map(float, values))
+
+
 def for_capture(profile: CameraProfile, capture: Capture) -> CameraProfile:
     """The profile with the fields and untrusted IMU intervals that apply to this capture.
 
     Those of another capture are removed.  A field over focus distance gets this capture's log, or is removed without.
     """
-    focus = [(frame.time_s, frame.focus_dioptres) for frame in capture.frames if frame.focus_dioptres is not None]
+    focus = focus_log(capture)
     fields: list[Field] = []
     for field in profile.fields:
         if field.stamp_0_ns not in (None, capture.stamp_0_ns):
@@ -81,9 +97,8 @@ def for_capture(profile: CameraProfile, capture: Capture) -> CameraProfile:
             log.info(text, capture.name, field.kind, field.covariates)
         elif "focus" not in field.covariates:
             fields.append(field)
-        elif focus:
-            times, values = zip(*focus, strict=True)
-            fields.append(replace(field, log=(times, values)))
+        elif focus is not None:
+            fields.append(replace(field, log=focus))
         else:
             log.warning("%s: no focus distance is logged: the field over it is ignored", capture.name)
     if profile.imu_untrusted_stamp_0_ns not in (None, capture.stamp_0_ns):

@@ -13,6 +13,7 @@ from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.structure import STRUCTURE_NOISES, Structure, structures
 from virest.diagnosis.tracking_stage import STRAY_PART
 from virest.image_formation.point_model import TrackTable, seen_s
+from virest.inference.blur_bias import RELATIVE_STD, blur_bias_px
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.robust import cauchy_weight, robust_std
 from virest.inference.track_fit import TrackFit
@@ -54,13 +55,8 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     """
     fitted, table = geometric.fit, geometric.table
     noise, covariates = geometric.noise_px, _covariates(fitted, table)
-    outwards = _from_centre_px(fitted, table) / np.maximum(covariates["radius"], 1.0)[:, None]
-    left_px = fitted.across_relief_px()
-    radial = (left_px * outwards).sum(axis=-1)
-    difference = np.concatenate([left_px, radial[:, None]], axis=-1)
     del covariates["time"]
-    found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
-    found.append(_along_time(left_px, fitted.weight, table.pair))
+    found = _point_structures(fitted, table, covariates)
     strongest = max(found, key=lambda s: s.size)
     stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.independent_share)
     limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
@@ -69,6 +65,11 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     noisier = beyond > STRUCTURE_PX and geometric.final_rms_px > SCALE_EXCESS * noise and p_noisier < STRUCTURE_P
     strays = geometric.independent_share > STRAY_PART or (stray > STRAY_PART and p_stray < STRUCTURE_P)
     log.debug("left: %s, limit %.3f, beyond noise %.3f, stray %.3f", found, limit, beyond, stray)
+    if strongest.size > limit and strongest.p_value < STRUCTURE_P and geometric.evidence is not None:
+        guided = np.array([pair.guided for pair in geometric.evidence.observed.pairs])
+        found = _point_structures(fitted, table, covariates, blur_bias_px(fitted.integrated, table, guided))
+        strongest = max(found, key=lambda s: s.size)
+        log.debug("without the tracker's bias between differently blurred frames: %s", found)
     if strongest.size > limit and strongest.p_value < STRUCTURE_P:
         sentence = f"residual {strongest.size:.3f} px, strongest along {strongest.along}"
         return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, True, sentence)
@@ -80,6 +81,23 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
         p_value = None if geometric.independent_share > STRAY_PART else p_stray
         return Remaining(p_value, "place", strongest.size, GEOMETRY, True, sentence)
     return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, False)
+
+
+def _point_structures(
+    fitted: TrackFit, table: TrackTable, covariates: dict[str, Array], bias_px: Array | None = None
+) -> list[Structure]:
+    """Structures of the residuals over the covariates and over time.
+
+    bias_px: (n, 2) of the tracked second points, which all points of a pair share: frames that are blurred differently
+    do not match at their true shift.  Known to RELATIVE_STD of its size, since textures differ.
+    """
+    left_px = fitted.across_relief_px(bias_px)
+    uncertain_px = None if bias_px is None else RELATIVE_STD * bias_px
+    outwards = _from_centre_px(fitted, table) / np.maximum(covariates["radius"], 1.0)[:, None]
+    radial = (left_px * outwards).sum(axis=-1)
+    difference = np.concatenate([left_px, radial[:, None]], axis=-1)
+    found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
+    return [*found, _along_time(left_px, fitted.weight, table.pair, uncertain_px)]
 
 
 def _from_centre_px(fitted: TrackFit, table: TrackTable) -> Array:
@@ -118,15 +136,20 @@ def _more_than_noise(distance: Array, pair: Index, noise: float) -> tuple[float,
     return first, second
 
 
-def _along_time(difference: Array, weight: Array, pair: Index) -> Structure:
-    """Structure over time: scatter of the pairs' mean residuals in excess of what the scatter of their points gives."""
+def _along_time(difference: Array, weight: Array, pair: Index, shared: Array | None = None) -> Structure:
+    """Structure over time: scatter of the pairs' mean residuals in excess of what the scatter of their points gives.
+
+    shared: (n, 2) standard deviation of an error with the same sign in all points of a pair.
+    """
     total = np.maximum(np.bincount(pair, weight), 1e-9)
     excess, chi2, freedom = 0.0, 0.0, 0
-    for column in difference.T:
+    errors = np.zeros_like(difference) if shared is None else shared
+    for column, error in zip(difference.T, errors.T, strict=True):
         mean = np.bincount(pair, weight * column) / total
         variance = np.bincount(pair, (weight * (column - mean[pair])) ** 2) / total**2
         used = np.bincount(pair) > LEAST_IN_PAIR
-        spread = 2 * variance[used] + TRACKING_BIAS_PX**2
+        common = np.bincount(pair, weight * error) / total
+        spread = 2 * variance[used] + TRACKING_BIAS_PX**2 + common[used] ** 2
         excess += float(np.mean(np.maximum(mean[used] ** 2 - spread, 0.0)))
         chi2 += float(np.sum(mean[used] ** 2 / spread))
         freedom += int(used.sum())

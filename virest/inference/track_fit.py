@@ -99,13 +99,17 @@ class TrackFit:
             return self.distance
         return _across_relief(self.difference_px, self.noise_px, self.along_px, depth_spread_per_m)
 
-    def across_relief_px(self) -> Array:
-        """Residuals (n, 2), px, reduced along the parallax by the points' spread of depths."""
+    def across_relief_px(self, bias_px: Array | None = None) -> Array:
+        """Residuals (n, 2), px, reduced along the parallax by the points' spread of depths.
+
+        bias_px: (n, 2) of the tracked points, subtracted first.
+        """
+        left_px = self.difference_px if bias_px is None else self.difference_px - bias_px
         if self.along_px is None:
-            return self.difference_px
+            return left_px
         length, way = lengths_and_ways(self.along_px)
         shrink = 1 - 1 / np.sqrt(1 + (self.depth_spread_per_m * length / self.noise_px) ** 2)
-        return self.difference_px - (shrink * (self.difference_px * way).sum(axis=-1))[:, None] * way
+        return left_px - (shrink * (left_px * way).sum(axis=-1))[:, None] * way
 
     def relief_cost(self) -> Array:
         """Log-likelihood penalty (n,) of the points' spread of depths: the logarithm of their standard deviation."""

@@ -17,6 +17,7 @@ from virest.arrays import Array
 from virest.camera.field import FORCES, KINDS, RATES, Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.capture.profile_source import focus_log
 from virest.capture.records import Capture
 from virest.diagnosis.field.forms import FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
 
@@ -65,14 +66,14 @@ def possible_forms(
     drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
     places = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), _off_centre_form(profile)]
     forms = [*places, *drifts]
-    forms += step_forms(capture, _candidate_steps_s(span_s, capture))
+    forms += step_forms(capture, candidate_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms += [_row_form(count) for count in (ROW_KNOTS, FINE_ROW_KNOTS)]
     if (focus := _focus_form(capture)) is not None:
         forms.append(focus)
     forms += [_rate_form(capture.imu, profile), _fine_rate_form(capture.imu, profile, known)]
     if capture.imu.has_accelerometer:
-        forms.append(_force_form())
+        forms.append(_force_form(known))
     return forms
 
 
@@ -236,14 +237,15 @@ def _drift_form(
     return FieldForm((field,), free, local=local, build=again(knots), refine=refine)
 
 
-def step_forms(capture: Capture, at_s: Array) -> list[FieldForm]:
-    """A sudden change of the focal length, one form for each instant (n,)."""
+def step_forms(capture: Capture, at_s: Array, kind: str = "scale") -> list[FieldForm]:
+    """A sudden change of the focal length, or of the gyroscope's bias (kind ``rate``): one form per instant (n,)."""
     edges = [np.array([t - STEP_EDGE_S / 2, t + STEP_EDGE_S / 2]) for t in at_s]
-    fields = [_zero("scale", (TIME,), [edge], capture.stamp_0_ns) for edge in edges]
-    return [FieldForm((f,), np.array([[0.0], [1.0]]), float(t)) for f, t in zip(fields, at_s, strict=True)]
+    fields = [_zero(kind, (TIME,), [edge], capture.stamp_0_ns) for edge in edges]
+    later = np.kron(np.array([[0.0], [1.0]]), np.eye(KINDS[kind][1]))
+    return [FieldForm((f,), later, float(t)) for f, t in zip(fields, at_s, strict=True)]
 
 
-def _candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
+def candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
     """Instants at which a sudden change is searched for."""
     frames = sum(span_s[0] <= frame.time_s <= span_s[1] for frame in capture.frames)
     return np.linspace(*span_s, min(frames // FRAMES_PER_STEP, MOST_STEPS) + 2)[1:-1]
@@ -251,13 +253,14 @@ def _candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
 
 def _focus_form(capture: Capture) -> FieldForm | None:
     """Over the logged focus distance, relative to the start of the capture."""
-    log = [(f.time_s, f.focus_dioptres) for f in capture.frames if f.focus_dioptres is not None]
-    values = np.array([value for _, value in log])
-    if len(log) < 0.5 * len(capture.frames) or np.ptp(values) < LEAST_FOCUS_CHANGE:
+    log = focus_log(capture)
+    if log is None or len(log[0]) < 0.5 * len(capture.frames):
+        return None
+    values = np.array(log[1])
+    if np.ptp(values) < LEAST_FOCUS_CHANGE:
         return None
     knots: Array = np.unique(np.round(np.linspace(values.min(), values.max(), FOCUS_KNOTS), 6))
-    times = tuple(float(time_s) for time_s, _ in log)
-    field = _zero("scale", ("focus",), [knots], None, (times, tuple(values.tolist())))
+    field = _zero("scale", ("focus",), [knots], None, log)
     return FieldForm((field,), null_space(cardinal_weights(field.knots[0], values[0])[None]))
 
 
@@ -313,8 +316,17 @@ def _over_rates(
     return FieldForm(tuple(fields), block_diag(*bases))
 
 
-def _force_form() -> FieldForm:
-    """Rates proportional to the specific force: 3 × 3 numbers, as values at FORCE_REACH_M_S2."""
+def _force_form(known: frozenset[str]) -> FieldForm:
+    """Rates linear in the specific force: 3 × 3 numbers, as values at FORCE_REACH_M_S2, and 3 at no force.
+
+    A bias measured at rest includes what gravity adds in that pose, so the rates at no force are the field's, unless
+    the bias is in the model.
+    """
     fields = tuple(_zero("rate", (name,), [np.array([-FORCE_REACH_M_S2, FORCE_REACH_M_S2])]) for name in FORCES)
-    odd = np.array([[-1.0], [1.0]]) / np.sqrt(2)
-    return FieldForm(fields, block_diag(*[np.kron(odd, np.eye(3))] * 3))
+    odd, even = np.array([[-1.0], [1.0]]) / np.sqrt(2), np.ones((2, 1)) / np.sqrt(2)
+    basis = np.asarray(block_diag(*[np.kron(odd, np.eye(3))] * 3))
+    if "gyro_bias" not in known:
+        at_no_force = np.zeros((len(basis), 3))
+        at_no_force[:6] = np.kron(even, np.eye(3))
+        basis = np.concatenate([basis, at_no_force], axis=1)
+    return FieldForm(fields, basis, build=lambda _profile, now: _force_form(now))

@@ -30,7 +30,7 @@ from virest.diagnosis.field.screening import (
     score_forms,
     select,
 )
-from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, sudden_change
+from virest.diagnosis.field.sudden import SuddenChange, best_instant, bias_step, lasting_change, sudden_change
 from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
     EXCESS_SCALE,
@@ -61,6 +61,8 @@ DEPTH = "scene_depth"
 """Translation in front of a near plane is confounded with gyroscope errors."""
 SCALE_OVER_TIME = f"scale{OVER}time"
 """Once a form of this family is in the model, no further sudden change is searched for."""
+RATE_OVER_TIME = f"rate{OVER}time"
+"""A bias that changes smoothly is tried beside one that changes at an instant."""
 MIN_EXCESS_REMOVED = 0.5
 """Minimum fraction of the excess loss at a sudden change that a fit to the other blocks must remove."""
 
@@ -196,9 +198,18 @@ class _Judged:
 def _best_step(
     judged: _Judged, found: GeometricVerdict, state: _SearchState, alternatives: Sequence[_Proposal]
 ) -> tuple[_Proposal, _Entered, _SearchState] | None:
-    """Add the form that predicts held-out blocks best; None where no form gains."""
+    """Add the simplest form, or one with more numbers that predicts held-out points better; None where none gains."""
     steps = [step for one in alternatives if (step := _step(judged, found, state, one)) is not None]
-    return min(steps, key=lambda step: float(step[1].after.losses.mean()), default=None)
+    if len(steps) < 2:
+        return next(iter(steps), None)
+    steps.sort(key=lambda step: step[1].form.basis.shape[1])
+    losses = [_held_out(judged.evidence, step[2].model, judged.fitted, by_point=True).losses for step in steps]
+    best = 0
+    for k in range(1, len(steps)):
+        gain = losses[best] - losses[k]
+        if gain.mean() > MIN_GAIN * losses[best].mean() and t_ratio(gain) > MIN_T:
+            best = k
+    return steps[best]
 
 
 def _step(
@@ -282,6 +293,9 @@ def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: Track
             scale = lasting_change(seen, tangent, search.effect(form))
             form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
         plain.append(_Proposal(form, selection, instead=instead))
+        if form.family == RATE_OVER_TIME:
+            stepped = bias_step(seen, tangent, capture, span_s, evidence.period_s)
+            plain.append(_Proposal(stepped, selection, instead=instead))
     yield tuple(plain)
     forms = [form for form in (*forms, *pairs) if form.local or (form.is_pair and form.family not in in_model)]
     smooth = list({form.family: form for form in reversed(alone) if not form.local and form.step_s is None}.values())

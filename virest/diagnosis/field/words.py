@@ -106,7 +106,7 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "turn the phone on a table by a known angle, again and again from a cold start",
     ),
     ("rate", ("time",)): Pattern(
-        "the gyroscope's bias changes by up to {size} over the capture",
+        "the gyroscope's bias changes by up to {size} over the capture, {shape} of time",
         "the sensor warms up, or the phone corrects its bias while it logs",
         "log the phone at rest for ten minutes from a cold start",
     ),
@@ -319,11 +319,14 @@ def lens_words(shape: str) -> str:
 def _size(fields: tuple[Field, ...]) -> tuple[float, float | None]:
     """Largest value and the deviation at the knot next to it.
 
-    Displacements and rates: vector length; focal length: range; acceleration sensitivity: value per m/s².
+    Displacements and rates: vector length; focal length: range; acceleration sensitivity: slope per m/s².
     """
     best, std = 0.0, None
     for field in fields:
         values = np.array(field.values)
+        if field.covariates[0] in FORCES:
+            field = field.with_values(values - values.mean(axis=0), np.array(field.std) if field.std else None)
+            values = np.array(field.values)
         length = np.linalg.norm(values, axis=1)
         row, largest = int(np.argmax(length)), float(length.max())
         if field.kind == "scale":
