@@ -48,6 +48,7 @@ from virest.inference.even_blur import even_guide, is_blurred
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
+from virest.inference.synchronisation import DRIFT_P
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import Guide, TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
@@ -73,12 +74,11 @@ SMALL_PART = 0.01
 """Smallest fraction of points that a note states as a number."""
 CONSTANT_EXPOSURE_S = 1e-4
 """If exposures vary by less, an offset cannot be separated from their scale, nor from the timestamp reference."""
-SUSPECTED_SIGMA, DRIFT_P, LEAST_DRIFT_S = 3.0, 1e-5, 1e-3
+SUSPECTED_SIGMA, LEAST_DRIFT_S = 3.0, 1e-3
 """Clock skew is fitted if one step from the fit without it exceeds SUSPECTED_SIGMA, and this much per capture.
 
 That step may be a part of the whole only, so the fit decides: the skew is kept if chance makes one as significant with
-a probability below DRIFT_P (Student's distribution with the time blocks that inform it, of which half a second has
-few)."""
+a probability below DRIFT_P."""
 SMALL_DRIFT_S = 0.02
 """Below this drift per capture, and without translation, the fit with a skew starts from the one without."""
 OTHER_FOCAL = 0.1
