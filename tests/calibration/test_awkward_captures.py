@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 from virest.app.calibrate import find_calibration, plan_calibration
 from virest.app.simulate import simulate_command
-from virest.calibration.geometry import calibrate_geometry
+from virest.calibration.geometry import _is_significant, calibrate_geometry
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import read_profile, write_profile
 from virest.capture.video import GrayReader, probe_movie
@@ -164,3 +165,12 @@ def test_drifting_clocks_are_fitted_as_if_asked_for(capture: Callable[..., Path]
         if one.std is not None:
             assert (np.abs(np.subtract(one.value, other.value)) < 0.1 * np.array(one.std)).all(), one.name
             np.testing.assert_allclose(one.std, other.std, rtol=0.05)
+
+
+@pytest.mark.parametrize(("blocks", "significant"), [(2.5, False), (12.0, True)])
+def test_a_drift_that_few_blocks_show_needs_more_deviations(blocks: float, significant: bool) -> None:
+    """7 σ: a normal deviate would be certain, Student's with one and a half degrees of freedom is no rarity."""
+    skew = SimpleNamespace(name="clock_skew", std=0.0005)
+    fit = SimpleNamespace(stretches=np.array([blocks]), slices={"clock_skew": slice(0, 1)})
+    found: Any = SimpleNamespace(fit=fit, values=(skew,), profile=SimpleNamespace(clock_skew=0.0035))
+    assert _is_significant(found, 0.0) == significant

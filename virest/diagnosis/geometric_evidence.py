@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +65,11 @@ class Evidence:
     """(pairs,) number of the time block."""
     break_s: Array
     """Times (breaks,) at which the path from the accelerometer is unknown, camera clock."""
-    _starts: dict[tuple[Hashable, ...], FitStart] = field(default_factory=dict, repr=False, compare=False)
+    _starts: dict[tuple[Hashable, ...], FitStart] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __reduce__(self) -> tuple[type[Evidence], tuple[Any, ...]]:
+        """Without the starts: in another process the models have other identities."""
+        return Evidence, (self.imu, self.observed, self.block, self.break_s)
 
     def start(self, model: Model, part: Hashable, table: Callable[[], TrackTable]) -> FitStart:
         """Where fits of a part of the points begin from a model; the last STARTS_KEPT are kept.

@@ -12,8 +12,9 @@ A point's blurred image lies at the mean of its blur path, so R is the mean over
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -92,6 +93,10 @@ class TrackTable:
     def n_windows(self) -> int:
         """Number of windows."""
         return len(self.origin_s)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields alone: what follows from them is not sent to other processes."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     @cached_property
     def both_px(self) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
@@ -37,9 +38,15 @@ class FitStart:
     scene: Motion | None = None
     integrated: IntegratedMotion | None = None
     """Of a similar profile, if known."""
-    _seen: dict[int, tuple[Motion | None, Seen]] = field(default_factory=dict, repr=False)
-    _slopes: dict[tuple[int, int], tuple[Term, Motion | None, Array]] = field(default_factory=dict, repr=False)
-    _moving: list[InertialMotion] = field(default_factory=list, repr=False)
+    _seen: dict[int, tuple[Motion | None, Seen]] = field(default_factory=dict, init=False, repr=False)
+    _slopes: dict[tuple[int, int], tuple[Term, Motion | None, Array]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+    _moving: list[InertialMotion] = field(default_factory=list, init=False, repr=False)
+
+    def __reduce__(self) -> tuple[type[FitStart], tuple[Any, ...]]:
+        """Without the results: in another process the objects have other identities."""
+        return FitStart, (self.imu, self.table, self.profile, self.scene, self.integrated)
 
     @cached_property
     def known(self) -> IntegratedMotion:

@@ -16,6 +16,7 @@ from virest.restoration.capture import RestorationPlan, restore_frames
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.sights import Sight, light_of, turn_between, with_neighbours
 from virest.restoration.settings import PRESETS
+from virest.restoration.taken_part import LEAST_CONFIRMED_DB
 from virest.simulation.phone_isp import PhoneIsp
 
 SIZE = {"width": 320, "height": 384, "focal_px": 350.0, "exposure_ms": 14.0, "rate_rad_s": 1.4, "frames": 8}
@@ -124,6 +125,20 @@ def test_a_frame_that_is_expected_to_lose_is_only_straightened(simulated, monkey
     assert left.degradation.deblur is None
     assert any("expected to gain only 0.00 dB" in warning for warning in left.warnings)
     np.testing.assert_array_equal(left.picture, straight.picture)
+
+
+@pytest.mark.parametrize(
+    ("predicted_db", "deblurred"), [(LEAST_CONFIRMED_DB - 0.01, False), (LEAST_CONFIRMED_DB, True)]
+)
+def test_a_prediction_within_its_own_error_is_not_acted_on(simulated, monkeypatch, predicted_db, deblurred):
+    """Half the predictions are off by more than the least one for which a frame is deblurred."""
+    capture = simulated()
+    plan = replace(capture.plan(PRESETS["fast"]), confirmed=ConfirmedGain(1.0, 0.2, 0.02, 4))
+    monkeypatch.setattr(ConfirmedGain, "of_change_db", lambda *_: (predicted_db, 0.2))
+    found = next(capture.restored(plan))
+    assert found.degradation is not None
+    assert (found.degradation.deblur is not None) == deblurred
+    assert any("expected to gain only 0.49 dB" in warning for warning in found.warnings) != deblurred
 
 
 def test_colour_is_restored_together_too(simulated):

@@ -30,6 +30,7 @@ from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.settings import PRESETS
 from virest.restoration.statistics import of_picture, ring_fit
 from virest.restoration.statistics.records import Misplaced
+from virest.restoration.taken_part import LEAST_CONFIRMED_DB
 
 Row = dict[str, Any]
 OTHER_SEEDS = 1000
@@ -119,7 +120,10 @@ def best_value(values: Sequence[float], gains_db: Array) -> Row:
 
 @dataclass(frozen=True, slots=True)
 class _RecordingGain(ConfirmedGain):
-    """A ConfirmedGain that records the arguments of its calls."""
+    """A ConfirmedGain that records the arguments of its calls, and promises every frame enough to be deblurred.
+
+    A fit to the frames whose prediction was high enough would follow the prediction.
+    """
 
     asked: list[tuple[float, float, float, float, float, Misplaced, tuple[float, float]]] = field(default_factory=list)
 
@@ -134,7 +138,7 @@ class _RecordingGain(ConfirmedGain):
         colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
         self.asked.append((changed, lost, ideal, power, coded, misplaced, colour))
-        return ConfirmedGain.of_change_db(self, changed, lost, ideal, power, coded, misplaced, colour)
+        return LEAST_CONFIRMED_DB, 0.0
 
 
 def _opened(work: Path, workload: Workload) -> TrueCapture:
