@@ -12,7 +12,7 @@ from motion.synthetic_tracks import Setup, recorded
 from virest.app.calibrate import _require_offset
 from virest.app.calibrate_curve import calibrate_curve
 from virest.app.process import _advice
-from virest.calibration.calibrated_values import ROUGH_OFFSET_S, CalibratedValue, roughly_known
+from virest.calibration.calibrated_values import ROUGH_OFFSET_S, CalibratedValue, roughly_known, with_estimates
 from virest.calibration.geometry import GeometryCalibration
 from virest.capture.detect import choose_reader
 from virest.errors import CalibrationError, CaptureError, OutputError
@@ -49,7 +49,7 @@ def test_an_offset_known_roughly_is_written_and_says_so(std_s: float, rough: boo
             _require_offset(calibrated(value))
 
 
-def test_an_offset_that_one_moment_tells_is_not_evenroughly_known() -> None:
+def test_an_offset_that_one_moment_tells_is_not_even_roughly_known() -> None:
     """Nothing bears a single block of time out."""
     fit = replace(fit_of(recorded(Setup(seed=5, frames=14))), stretches=np.array([1.1]))
     assert not roughly_known(CalibratedValue("time_offset_s", None, 0.45, 0.0032, determined=False), fit).rough
@@ -78,10 +78,22 @@ def test_a_movie_that_follows_no_gyroscope_has_to_be_recorded_again() -> None:
     assert "stabilisation" not in axes
 
 
+def test_a_calibration_that_left_values_open_is_not_advised_again() -> None:
+    """Its profile holds its estimates; the same command would find as little in the same capture."""
+    profile = replace(recorded(Setup(seed=3, frames=6)).profile, time_offset_s=None, intrinsics=None)
+    assert "run virest calibrate" in _advice(RestorationPlan(profile, RestorationSettings()))
+    offset = CalibratedValue("time_offset_s", None, 0.43, 0.0028, determined=True)
+    written = replace(with_estimates(profile, (offset,)), time_offset_s=0.43)
+    advice = _advice(RestorationPlan(written, RestorationSettings()))
+    assert "run virest calibrate" not in advice
+    assert "focal length unknown" in advice
+    assert "record again" in advice
+
+
 def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:
     """And of another one the error says what it holds instead."""
     with pytest.raises(CaptureError, match="; it is empty"):
         choose_reader(tmp_path)
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(CaptureError, match=r"\(but notes.txt\)"):
+    with pytest.raises(CaptureError, match=r"\(it holds notes.txt\)"):
         choose_reader(tmp_path)

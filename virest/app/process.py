@@ -39,6 +39,7 @@ from virest.app.run_folder import (
     write_failure,
 )
 from virest.app.segments import Segment, cut_frames, make_segment
+from virest.calibration.calibrated_values import SOURCE as CALIBRATED
 from virest.capture.location import locate
 from virest.capture.video import MovieIndex
 from virest.errors import CaptureError, OutputError, SettingsError, VirestError
@@ -357,9 +358,16 @@ def _advice(plan: RestorationPlan) -> str:
         )
         if not known
     ]
+    names = " and ".join(unknown)
+    if unknown and any(estimate.source == CALIBRATED for estimate in plan.profile.estimates.values()):
+        them = "them" if len(unknown) > 1 else "it"
+        return (
+            f"{names} unknown, and virest calibrate could not determine {them} from this capture: "
+            f"state {them} in camera.yaml, or record again while rotating the phone about all three axes"
+        )
     if unknown:
-        names = " and ".join(unknown)
-        return f"{names} unknown: run virest calibrate CAPTURE --with focal, then process --config camera.yaml"
+        focal = " --with focal" if plan.profile.intrinsics is None else ""
+        return f"{names} unknown: run virest calibrate CAPTURE{focal}, then process --config camera.yaml"
     return ""
 
 

@@ -18,6 +18,8 @@ from virest.inference.chance import student_deviation
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.track_fit import TrackFit
 
+SOURCE = "tracked points against the inertial data"
+"""Source of the estimates in a profile that a calibration wrote."""
 MIN_STRETCHES = 2.5
 """A value must be supported by this effective number of time blocks; with fewer, nothing confirms it."""
 LARGE_CORRELATION = 0.9
@@ -144,10 +146,9 @@ def value_of(
 
 def with_estimates(profile: CameraProfile, values: Sequence[CalibratedValue]) -> CameraProfile:
     """Add the estimates of determined and rough values to the profile."""
-    source = "tracked points against the inertial data"
     for value in values:
         if (value.determined or value.rough) and value.value is not None:
-            profile = profile.with_estimate(value.name, value.value, value.std, source)
+            profile = profile.with_estimate(value.name, value.value, value.std, SOURCE)
     known = profile.readout_known or any(v.name == "readout_time_s" and v.determined for v in values)
     return replace(profile, readout_known=known)
 

@@ -49,6 +49,8 @@ from virest.errors import CaptureError
 Reader = Callable[[Path, list[Note]], Source]
 HEAD_BYTES = 4096
 """The first lines of a log, with the header that identifies it."""
+LISTED = 6
+"""Number of names of a folder that an error lists."""
 HINT = "pass a capture folder: MARSLogger, EuRoC, images with timestamps, or a movie with .gcsv or embedded telemetry"
 
 
@@ -65,7 +67,8 @@ def choose_reader(folder: Path) -> Reader:
         return reader
     if is_bag(folder):
         raise CaptureError(f"{folder.name}: is a ROS 2 bag", hint="unpack it first: virest import BAG FOLDER")
-    instead = f" (but {', '.join(names[:6])})" if names else "; it is empty"
+    more = ", …" if len(names) > LISTED else ""
+    instead = f" (it holds {', '.join(names[:LISTED])}{more})" if names else "; it is empty"
     text = f"{folder.name}: holds no {MOVIE} and no {GYRO}{instead}"
     raise CaptureError(text, hint=HINT)
 

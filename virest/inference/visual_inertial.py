@@ -286,8 +286,8 @@ def _far_from_profile(fit: TrackFit) -> str:
     for term in fit.terms:
         ratio = float(np.max(np.abs(fit.value(term.name)) / np.array(term.prior_std)))
         if ratio > MAX_PRIOR_STD:
-            name = term.name.replace("_", " ")
-            return f"frames and accelerometer fit only with a {name} {ratio:.0f} σ from the profile's"
+            name = term.name.replace("_", " ").replace("imu", "IMU")
+            return f"frames and accelerometer fit only if the {name} is {ratio:.0f} σ off the profile's"
     return ""
 
 

@@ -415,12 +415,12 @@ def _with_estimates(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTr
         return plan
     if not estimate.determined:
         plan = plan.noted(NoteCode.TIME_OFFSET, f"time offset not determined ({estimate.reason})")
-        if plan.refusal:
-            return plan
         if estimate.other_axes:
             return plan.refused(NoteCode.OTHER_AXES, "the gyroscope's axes are not the profile's: virest calibrate")
         if estimate.explained < MIN_EXPLAINED:
             return plan.refused(NoteCode.NOT_FOLLOWING, "the frames do not follow the gyroscope")
+        if plan.refusal:
+            return plan
         return plan.refused(NoteCode.TIME_OFFSET, "time offset not determined: virest calibrate")
     offset_s = estimate.time_offset_s
     profile = plan.profile.with_estimate(
