@@ -1,4 +1,4 @@
-"""A Dask scheduler and workers as processes of their own, as on a real cluster."""
+"""A Dask scheduler and its workers as separate processes, as on a real cluster."""
 
 import os
 import re
@@ -12,7 +12,7 @@ START_S = 60
 
 
 class Cluster:
-    """A scheduler on a free port, and workers that can be killed."""
+    """A scheduler on a free port with workers that can be killed."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -24,7 +24,7 @@ class Cluster:
         self.address = line
 
     def add_worker(self) -> None:
-        """Start one more worker: one thread, and no nanny that would start it again."""
+        """Start one more worker with one thread and without a nanny that would restart it."""
         name = f"worker-{len(self.workers)}"
         worker, _ = self._start(
             name, "distributed.cli.dask_worker", r"Registered to:", self.address, "--no-nanny", "--nthreads", "1",
@@ -43,14 +43,14 @@ class Cluster:
         return process, wait_for_line(log, ready, process)
 
     def close(self) -> None:
-        """End what still runs."""
+        """Kill all processes that are still running."""
         for process in (*self.workers, self.scheduler):
             process.kill()
             process.wait()
 
 
 def wait_for_line(log: Path, pattern: str, process: "subprocess.Popen[bytes]") -> str:
-    """Wait until a line of a log matches; gives its first group, or the whole."""
+    """Wait until a line of a log matches; return its first group, or the whole match."""
     import time
 
     end = time.monotonic() + START_S
@@ -64,7 +64,7 @@ def wait_for_line(log: Path, pattern: str, process: "subprocess.Popen[bytes]") -
 
 @contextmanager
 def running_cluster(folder: Path, workers: int) -> Iterator[Cluster]:
-    """A cluster with so many workers, gone at the end."""
+    """A cluster with the given number of workers, closed on exit."""
     folder.mkdir(parents=True, exist_ok=True)
     cluster = Cluster(folder)
     try:

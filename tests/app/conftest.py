@@ -17,12 +17,12 @@ START_NS, IMU_STEP_NS = 5_000_000_000, 5_000_000
 
 
 def rates_rad_s(time_s: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How the phone turns, unevenly about all three of its axes, by the seconds from the first frame."""
+    """Angular rates of the phone about its three axes, by seconds since the first frame."""
     return 1.1 * np.sin(9 * time_s + 0.3), 1.7 * np.cos(6 * time_s), 0.6 * np.sin(13 * time_s)
 
 
 def write_movie(folder: Path) -> None:
-    """Write what the profile's camera sees of a far texture while it turns so, with a key frame every 8."""
+    """Write what the profile's camera sees of a distant texture during this motion; every 8th frame is a key frame."""
     from virest.camera.profile_file import read_profile
     from virest.simulation.exposure import expose, make_view
     from virest.simulation.recorded_motion import recorded_motion
@@ -48,7 +48,7 @@ def write_movie(folder: Path) -> None:
 
 
 def write_logs(folder: Path) -> None:
-    """Write stamps, exposures, and the rates of a phone that turns unevenly."""
+    """Write frame timestamps, exposure times and the gyroscope rates of an unevenly turning phone."""
     stamps = [START_NS + i * PERIOD_NS for i in range(FRAMES)]
     (folder / "frame_timestamps.txt").write_text("Frame timestamp[nanosec]\n" + "".join(f"{t}\n" for t in stamps))
     head = (
@@ -72,7 +72,7 @@ def write_logs(folder: Path) -> None:
 
 
 def write_profile(folder: Path) -> None:
-    """Write a profile with nothing left to estimate."""
+    """Write a profile that leaves nothing to estimate."""
     profile = {
         "virest_profile": 1,
         "image": {"width": WIDTH, "height": HEIGHT},
@@ -97,7 +97,7 @@ def _tiny_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def tiny(_tiny_capture: Path, tmp_path: Path) -> Path:
-    """A good capture of 24 frames, 160 × 120, named ``tiny``; the test may damage it."""
+    """An intact capture of 24 frames, 160 × 120, named ``tiny``; the test may damage it."""
     return Path(shutil.copytree(_tiny_capture, tmp_path / "tiny"))
 
 
@@ -117,7 +117,7 @@ def edit_gyro(tiny: Path) -> Callable[[Callable[[list[str]], list[str]]], None]:
 def virest_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> Callable[..., SimpleNamespace]:
-    """The program in this process, in an empty folder: quicker than a process of its own for each call."""
+    """Run the program in this process, in an empty folder: faster than a new process for each call."""
     from virest.app.cli import run
 
     monkeypatch.chdir(tmp_path)
@@ -144,7 +144,7 @@ def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def long_swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As ``swing``, but of 24 frames: more segments than two workers begin at once."""
+    """Like ``swing``, but with 24 frames: more segments than two workers start at once."""
     from virest.app.simulate import simulate_command
 
     folder = tmp_path_factory.mktemp("captures") / "swing"

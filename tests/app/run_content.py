@@ -1,4 +1,4 @@
-"""What a run leaves, without what clocks and places decide: to be compared byte for byte."""
+"""Contents of a run without its clock times and paths, for byte-for-byte comparison."""
 
 import json
 from pathlib import Path
@@ -8,19 +8,22 @@ CLOCKS = ("totals", "command")
 
 
 def folder_files(run: Path) -> dict[str, bytes]:
-    """All files below a folder, hidden ones too."""
+    """All files below a folder, including hidden ones."""
     return {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*") if p.is_file()}
 
 
 def content(run: Path) -> dict[str, Any]:
-    """Everything in a run's folder, OUT/NAME, without what a clock, the command line or the place of OUT decides."""
+    """Everything in a run's folder, OUT/NAME, except what the clock, the command line or OUT's location decides."""
     files = folder_files(run)
     files["run.json"] = files["run.json"].replace(str(run.parent.parent).encode(), b".")
     return without_clocks(files)
 
 
 def without_clocks(files: dict[str, bytes], *elsewhere: str) -> dict[str, Any]:
-    """Files of a run without seconds, command, and the named keys of run.json; with such keys, without paths too."""
+    """A run's files without durations, the command and the named keys of run.json.
+
+    If keys are named, paths are removed too.
+    """
     found: dict[str, Any] = dict(files)
     lines = [json.loads(line) for line in found["parameters.jsonl"].splitlines()]
     found["parameters.jsonl"] = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]

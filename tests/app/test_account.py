@@ -1,4 +1,4 @@
-"""What run.json adds up over the lines of a run."""
+"""Totals that run.json computes from the lines of a run's log."""
 
 import json
 from pathlib import Path
@@ -9,12 +9,12 @@ from virest.app.account import run_totals
 
 
 def line(status: str, **deblur: object) -> dict[str, object]:
-    """A line of the log, as far as it is added up."""
+    """The fields of a log line that enter the totals."""
     return {"status": status, "done": ["deblurred"] if deblur else [], "seconds": {"write": 0.5}, "deblur": deblur}
 
 
-def test_what_neighbours_brought_is_the_mean_over_frames_that_had_some(tmp_path: Path):
-    """Frames without neighbours count for nothing; a run without any says null."""
+def test_the_neighbours_gain_is_the_mean_over_frames_that_used_neighbours(tmp_path: Path):
+    """Frames without neighbours do not enter the mean; a run without any neighbours reports null."""
     log = tmp_path / "parameters.jsonl"
     two = [{"frame": 1, "weight": 0.9}, {"frame": 3, "weight": 0.7}]
     lines = [

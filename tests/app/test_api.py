@@ -1,4 +1,4 @@
-"""``import virest``: opening, restoring and deblurring on arrays, and the commands' records, without a file written."""
+"""``import virest``: opening captures, restoring and deblurring arrays, and the commands' records."""
 
 import inspect
 import subprocess
@@ -22,7 +22,7 @@ FRAME = 5
 
 
 def psnr_db(first: np.ndarray, second: np.ndarray, border: int = 40) -> float:
-    """Of two pictures, without their borders."""
+    """PSNR between two pictures, without their borders."""
     inner = np.s_[border:-border, border:-border]
     error = first[inner].astype(float) - second[inner].astype(float)
     return float(10 * np.log10(255**2 / np.mean(error**2)))
@@ -30,28 +30,28 @@ def psnr_db(first: np.ndarray, second: np.ndarray, border: int = 40) -> float:
 
 @pytest.fixture(scope="module")
 def truth() -> np.ndarray:
-    """The sharp frame of the sample."""
+    """The sharp frame of the sample capture."""
     picture = cv2.imread(str(SAMPLE / "truth" / "frames" / f"{FRAME:06d}.png"))
     assert picture is not None
     return np.ascontiguousarray(picture[..., ::-1])
 
 
 def test_importing_virest_loads_no_heavy_library() -> None:
-    """The package's door loads nothing but itself; numpy and OpenCV come with the first function that needs them."""
+    """Importing the package loads only the package. The first function that needs numpy or OpenCV loads it."""
     code = "import sys, virest; print([m for m in ('numpy', 'cv2', 'scipy', 'pandas', 'pydantic') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-def test_every_name_of_the_interface_is_there() -> None:
-    """What ``__all__`` promises can be had; what it does not promise is an AttributeError."""
+def test_every_name_in_all_exists() -> None:
+    """Every name in ``__all__`` is available; any other name raises AttributeError."""
     assert all(getattr(virest, name) is not None for name in virest.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = virest.nothing
 
 
-def test_a_frame_is_restored_by_one_call(truth: np.ndarray) -> None:
-    """A frame, inertial samples and a profile give a picture that is nearer to the truth than the recorded one."""
+def test_one_call_restores_a_frame(truth: np.ndarray) -> None:
+    """The restored picture is at least 3 dB closer to the truth than the recorded frame."""
     capture = virest.open(SAMPLE)
     recorded, stamp = capture.read_frame(FRAME), capture.frames[FRAME]
     restored = virest.restore(
@@ -66,7 +66,7 @@ def test_a_frame_is_restored_by_one_call(truth: np.ndarray) -> None:
 
 
 def test_a_grey_frame_stays_grey() -> None:
-    """A frame (height, width) comes back as such."""
+    """A frame of shape (height, width) is restored to the same shape."""
     capture = virest.open(SAMPLE)
     grey = cv2.cvtColor(capture.read_frame(FRAME), cv2.COLOR_RGB2GRAY)
     stamp = capture.frames[FRAME]
@@ -76,7 +76,7 @@ def test_a_grey_frame_stays_grey() -> None:
 
 
 def _blurred(sharp: np.ndarray, kernel: np.ndarray, curve: ResponseCurve, rng: np.random.Generator) -> np.ndarray:
-    """The picture convolved in linear light, with noise: independent of the package's kernels."""
+    """The picture convolved in linear light, with noise, independently of the package's kernels."""
     light = curve.linear_table()[sharp]
     turned = kernel[::-1, ::-1] / kernel.sum()
     light = cv2.filter2D(light, -1, turned, anchor=(kernel.shape[1] // 2, kernel.shape[0] // 2))
@@ -85,8 +85,8 @@ def _blurred(sharp: np.ndarray, kernel: np.ndarray, curve: ResponseCurve, rng: n
 
 
 @pytest.mark.parametrize("colour", [True, False])
-def test_a_kernel_is_undone_without_moving_the_picture(truth: np.ndarray, colour: bool) -> None:
-    """Of a picture blurred by a lopsided kernel the sharp one comes back in its place."""
+def test_deblurring_with_a_kernel_does_not_shift_the_picture(truth: np.ndarray, colour: bool) -> None:
+    """A picture blurred by an asymmetric kernel is restored at its original position."""
     sharp = truth[300:700, 100:620] if colour else cv2.cvtColor(truth[300:700, 100:620], cv2.COLOR_RGB2GRAY)
     kernel = np.zeros((15, 19))
     kernel[7, 9:18] = 1.0
@@ -97,8 +97,8 @@ def test_a_kernel_is_undone_without_moving_the_picture(truth: np.ndarray, colour
     assert psnr_db(restored, sharp) > psnr_db(recorded, sharp) + 4.0
 
 
-def test_a_path_is_undone_without_moving_the_picture(truth: np.ndarray) -> None:
-    """Of a picture whose points moved along a path the sharp one comes back, as it was when the path began."""
+def test_deblurring_with_a_path_does_not_shift_the_picture(truth: np.ndarray) -> None:
+    """A picture blurred along a path is restored as it was at the start of the path."""
     sharp = truth[300:700, 100:620]
     kernel = np.zeros((19, 19))
     kernel[9, 9:19] = 1.0
@@ -107,8 +107,8 @@ def test_a_path_is_undone_without_moving_the_picture(truth: np.ndarray) -> None:
     assert psnr_db(restored, sharp) > psnr_db(recorded, sharp) + 4.0
 
 
-def test_wrong_arguments_are_errors_with_a_hint() -> None:
-    """Sizes, kinds and names that cannot be are one line each, not a traceback of numpy."""
+def test_invalid_arguments_raise_errors_with_a_hint() -> None:
+    """Invalid sizes, types and names raise a one-line error instead of a traceback from numpy."""
     capture = virest.open(SAMPLE)
     with pytest.raises(SettingsError, match="uint8"):
         virest.deblur(np.zeros((64, 64)), np.ones((3, 3)))
@@ -124,10 +124,10 @@ def test_wrong_arguments_are_errors_with_a_hint() -> None:
         capture.read_frame(99)
 
 
-def test_calibrating_gives_the_record_and_writes_only_what_is_asked_for(
+def test_calibrate_returns_the_record_and_writes_only_on_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Calibrating returns what ``--json`` prints; without ``out`` nothing is written."""
+    """``virest.calibrate`` returns what ``--json`` prints; without ``out`` it writes nothing."""
     monkeypatch.chdir(tmp_path)
     simulated = virest.simulate(
         "walk", width=256, height=192, frames=18, seed=2, rate_rad_s=1.5, exposure_ms=6.0, effects=["time_offset=0.02"]
@@ -146,23 +146,23 @@ def test_calibrating_gives_the_record_and_writes_only_what_is_asked_for(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_an_exposed_and_developed_capture_has_the_declared_facts(tmp_path: Path) -> None:
-    """Auto-exposure and the phone's own processing add facts, all of which a type checker knows."""
+def test_a_capture_with_auto_exposure_and_isp_has_the_declared_facts(tmp_path: Path) -> None:
+    """Auto-exposure and the phone's image processing add facts that the type declaration lists."""
     simulated = virest.simulate(
         tmp_path / "phone", width=128, height=96, frames=3, auto_exposure_ev=2.0, isp=make_isp("phone")
     )
     assert set(simulated) == set(SimulationFacts.__annotations__)
 
 
-def test_a_capture_that_does_not_tell_is_an_error(tmp_path: Path) -> None:
-    """A camera at rest determines nothing."""
+def test_calibrating_a_camera_at_rest_is_an_error(tmp_path: Path) -> None:
+    """A camera at rest determines no value."""
     virest.simulate(tmp_path / "rest", width=320, height=240, frames=8, rate_rad_s=0.0)
     with pytest.raises(CalibrationError):
         virest.calibrate(tmp_path / "rest")
 
 
 def test_the_typed_options_are_those_of_the_simulator() -> None:
-    """A type checker knows each keyword that simulate takes, with its type, and no other."""
+    """The type declaration lists exactly the keywords that ``simulate`` takes, with their types."""
     taken = {
         name: parameter.annotation
         for name, parameter in inspect.signature(simulate_command).parameters.items()

@@ -1,4 +1,4 @@
-"""The bench: what its tables say of given figures. No figure here is measured on the machine's clock."""
+"""The bench's tables for given figures. No figure here is measured with the machine's clock."""
 
 import json
 import subprocess
@@ -39,7 +39,7 @@ def run(frames: int, wall_s: float, cpu_s: float, others_cores: float = 0.125, *
 
 
 def entry(name: str, wall_s: float, one_wall_s: float, **of_line: Any) -> Facts:
-    """A measured preset: seconds a frame with two processes and with one, and 1.1 times that of CPU time."""
+    """A measured preset: wall time per frame with two processes and with one, and CPU time 1.1 times as high."""
 
     def found(seconds: float, cores: int) -> Facts:
         runs = [run(n, 3 + n * seconds, 2 + 1.1 * cores * n * seconds, **of_line) for n in (20, 40)]
@@ -49,7 +49,7 @@ def entry(name: str, wall_s: float, one_wall_s: float, **of_line: Any) -> Facts:
 
 
 def speed_facts(**of_floor: Any) -> Facts:
-    """Everything the section ``speed`` gives, at known figures: floor 25, fast 10, balanced 8 and best 0.2 frames/s."""
+    """Everything the section ``speed`` returns, at known rates: floor 25, fast 10, balanced 8 and best 0.2 frames/s."""
     floor = entry("floor", 0.04, 0.076, **{"deblur": "none", **of_floor})
     measured = [floor, entry("fast", 0.1, 0.19), entry("balanced", 0.125, 0.2), entry("best", 5.0, 9.5)]
     return {"jobs": 2, "size": "720x1280", "content": "dead leaves", "blur_px": 9.0, "processor": "Z80",
@@ -65,8 +65,8 @@ def by_name(facts: Facts) -> dict[str, Facts]:
 # ── speed ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_frame_takes_the_difference_of_two_runs() -> None:
-    """What both runs spend on starting and planning does not count; stages get the CPU time in proportion."""
+def test_the_time_per_frame_is_the_difference_of_two_runs() -> None:
+    """Start-up and planning time, which both runs share, cancels. Stages divide CPU time in proportion."""
     found = speed.per_frame(run(20, 7.0, 9.0), run(40, 10.0, 14.4), 20)
     assert found["frames"] == [20, 40]
     assert found["s_per_frame"] == pytest.approx(0.15)
@@ -77,7 +77,7 @@ def test_a_frame_takes_the_difference_of_two_runs() -> None:
 
 
 def test_shares_scaling_and_estimation_follow_from_the_measured_times() -> None:
-    """The floor over the preset, one process over two, and planning laid on a capture of thirty seconds."""
+    """The ratio of floor to preset, of one process to two, and the planning time spread over a capture of 30 s."""
     fast = by_name(speed_facts())["fast"]
     assert fast["share_of_floor"] == pytest.approx(0.4)
     assert fast["share_of_floor_by_cpu"] == pytest.approx(0.4)
@@ -90,8 +90,8 @@ def test_shares_scaling_and_estimation_follow_from_the_measured_times() -> None:
 
 
 @pytest.mark.parametrize("spoilt", [{"shutter": "none"}, {"deblur": "wiener"}])
-def test_a_floor_that_is_more_or_less_than_decode_warp_and_png_is_no_floor(spoilt: Facts) -> None:
-    """Frames that were not warped, or deblurred all the same, measure something else: no share is told."""
+def test_a_floor_with_other_work_than_decode_warp_and_png_is_not_used(spoilt: Facts) -> None:
+    """A floor run without warping, or with deblurring, measures something else: no share is reported."""
     facts = speed_facts(**spoilt)
     assert not facts["floor"]["pure"]
     assert all(e["share_of_floor"] is None for e in facts["presets"])
@@ -99,8 +99,8 @@ def test_a_floor_that_is_more_or_less_than_decode_warp_and_png_is_no_floor(spoil
     assert "NOT MEASURED" not in speed.speed_text(speed_facts())
 
 
-def test_the_speed_tables_hold_every_preset_stage_and_peer() -> None:
-    """Floor and presets by their rates, each peer by its ratio, and what is missing by how to get it."""
+def test_the_speed_tables_list_every_preset_stage_and_peer() -> None:
+    """Floor and presets appear with their rates, peers with their ratios, a missing peer with its install command."""
     text = speed.speed_text(speed_facts())
     rows = {words[0]: words for words in (line.split() for line in text.splitlines()) if words}
     assert [rows[name][1] for name in ("floor", "fast", "balanced", "best")] == ["25.00", "10.00", "8.00", "0.20"]
@@ -111,7 +111,7 @@ def test_the_speed_tables_hold_every_preset_stage_and_peer() -> None:
 
 
 def test_a_stage_without_work_has_no_rate() -> None:
-    """Nothing is divided by nothing."""
+    """A stage that takes no time has neither a rate nor a ratio to a peer."""
     assert speed.stage_rate(0.0) == "-"
     assert speed.stage_rate(0.004) == "250"
     idle = entry("fast", 0.1, 0.2, deblur="none")
@@ -120,7 +120,7 @@ def test_a_stage_without_work_has_no_rate() -> None:
 
 
 def test_deepinv_wiener_is_the_wiener_filter() -> None:
-    """An asymmetric kernel: conj(K) / (|K|² + N/S), in deepinv's convention as in ours."""
+    """An asymmetric kernel gives conj(K) / (|K|² + N/S) in deepinv's convention as in ours."""
     pytest.importorskip("deepinv")
     rng = np.random.default_rng(3)
     plane, kernel = rng.random((60, 44), np.float32), rng.random((7, 7), np.float32)
@@ -130,13 +130,13 @@ def test_deepinv_wiener_is_the_wiener_filter() -> None:
     np.testing.assert_allclose(peers.deepinv_wiener(plane, kernel, 0.03), ours, atol=1e-4)
 
 
-def test_every_scikit_method_has_a_setting_to_be_timed_with() -> None:
-    """Those of the table are those of the library."""
+def test_every_scikit_method_has_settings_for_timing() -> None:
+    """The timed peers are exactly the methods that the library offers."""
     assert set(speed.PEER_SETTINGS) == set(SCIKIT)
 
 
-def test_a_difference_that_others_made_negative_is_no_rate() -> None:
-    """What the CPU time says remains."""
+def test_a_negative_wall_time_difference_gives_no_rate() -> None:
+    """Other processes can make the longer run seem shorter; the shares by CPU time are still reported."""
     found = speed.per_frame(run(20, 7.0, 9.0), run(40, 6.5, 14.4), 20)
     assert found["frames_per_s"] is None
     whole = {"preset": "fast", **found, "one_process": found}
@@ -151,8 +151,8 @@ def test_a_difference_that_others_made_negative_is_no_rate() -> None:
 # ── growth ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_an_exponent_is_found_again() -> None:
-    """Without noise exactly; with noise within its own standard deviation's reach."""
+def test_a_known_exponent_is_recovered() -> None:
+    """The fit is exact without noise; with noise, its standard deviation matches the scatter of the errors."""
     sizes = np.array([3.0, 7.0, 20.0, 90.0])
     assert growth.fitted_exponent(sizes, 0.2 * sizes**1.3) == (pytest.approx(1.3), pytest.approx(0.0, abs=1e-9))
     assert growth.fitted_exponent(sizes[:2], 5 * sizes[:2] ** -0.4) == (pytest.approx(-0.4), None)
@@ -164,15 +164,15 @@ def test_an_exponent_is_found_again() -> None:
 
 
 @pytest.mark.parametrize("power", [0.9, 1.0, 1.4])
-def test_start_and_planning_do_not_hide_how_time_grows_with_frames(power: float) -> None:
-    """Of start + c frames^p over N, 2 N and 4 N the power comes out, whatever the start takes."""
+def test_start_up_time_does_not_bias_the_growth_exponent(power: float) -> None:
+    """Times of start + c frames^p at N, 2 N and 4 N frames give p, whatever the start takes."""
     rows = [{"frames": n, "wall_s": 7 + 0.05 * n**power, "cpu_s": 2 + 0.08 * n**power} for n in (30, 60, 120)]
     found = growth.doubling_exponents(rows)
     assert found == {"exponent": pytest.approx(power), "wall_exponent": pytest.approx(power)}
 
 
-def test_runs_that_get_shorter_have_no_exponent() -> None:
-    """On a disturbed machine more frames may seem to take less."""
+def test_decreasing_times_give_no_exponent() -> None:
+    """On a busy machine, more frames may seem to take less time."""
     rows = [{"frames": n, "wall_s": w, "cpu_s": n / 10} for n, w in ((30, 9.0), (60, 8.0), (120, 12.0))]
     assert growth.doubling_exponents(rows)["wall_exponent"] is None
     spoilt = [{"pixels": 100, "cpu_s_per_frame": -0.1}, {"pixels": 300, "cpu_s_per_frame": 0.2}]
@@ -181,7 +181,7 @@ def test_runs_that_get_shorter_have_no_exponent() -> None:
 
 
 def growth_facts() -> Facts:
-    """Everything the section ``growth`` gives, of a linear time over frames."""
+    """Everything the section ``growth`` returns for a time that is linear in frames."""
     rows = [{"frames": n, "wall_s": 5 + 0.05 * n, "cpu_s": 3 + 0.1 * n} for n in (30, 60, 120)]
     times = {"s_per_frame": 0.1, "cpu_s_per_frame": 0.09, "deblur_cpu_s": 0.04, "others_cores": 0.0}
     return {
@@ -192,8 +192,8 @@ def growth_facts() -> Facts:
     }
 
 
-def test_the_growth_tables_say_what_a_further_frame_takes() -> None:
-    """The first run has nothing to be compared with; the others give the same time for each frame."""
+def test_the_growth_tables_show_the_time_of_one_more_frame() -> None:
+    """The first run has no earlier run to compare with; the others give the same time per additional frame."""
     text = growth.growth_text(growth_facts())
     rows = [line.split() for line in text.splitlines()]
     assert ["30", "6.5", "6.0", "-", "-"] in rows
@@ -209,8 +209,8 @@ CHILD = "import time; kept = bytearray(120_000_000); del kept; time.sleep(1.5)"
 PARENT = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {CHILD!r}], check=True)"
 
 
-def test_a_workers_peak_is_its_own_and_is_seen_after_it_is_gone() -> None:
-    """A child that frees what it took is told apart from its parent, by the kernel's own record."""
+def test_a_workers_peak_is_separate_and_recorded_after_it_exits() -> None:
+    """The kernel's record separates the peak of a child, which frees its memory, from that of its parent."""
     peaks = memory.peaks_of([sys.executable, "-c", PARENT])
     assert peaks.worker_bytes > 120e6
     assert 1e6 < peaks.main_bytes < 60e6
@@ -218,8 +218,8 @@ def test_a_workers_peak_is_its_own_and_is_seen_after_it_is_gone() -> None:
         memory.peaks_of([sys.executable, "-c", "raise SystemExit(3)"])
 
 
-def test_memory_is_told_for_a_worker_and_for_all() -> None:
-    """And what the longest movie takes beyond the shortest."""
+def test_memory_is_reported_for_a_worker_and_in_total() -> None:
+    """The report also states how much the longest movie takes relative to the shortest."""
     facts = memory_facts()
     assert facts["grown"] == {"peak": pytest.approx(1.1), "worker": pytest.approx(1.04)}
     rows = [line.split() for line in memory.memory_text(facts).splitlines()]
@@ -227,7 +227,7 @@ def test_memory_is_told_for_a_worker_and_for_all() -> None:
 
 
 def memory_facts() -> Facts:
-    """Everything the section ``memory`` gives, of a worker that grows little and a whole that grows more."""
+    """Everything the section ``memory`` returns for a worker that grows little and a total that grows more."""
     runs = [
         {"frames": 100, "worker_mb": 250.0, "main_mb": 190.0, "peak_mb": 700.0, "wall_s": 12.0},
         {"frames": 3000, "worker_mb": 260.0, "main_mb": 200.0, "peak_mb": 770.0, "wall_s": 90.0},
@@ -238,8 +238,8 @@ def memory_facts() -> Facts:
 BUSY = "import time\nwhile time.process_time() < 0.2: pass"
 
 
-def test_the_time_of_a_command_holds_that_of_its_children() -> None:
-    """CPU seconds of a grandchild count; a failure is no measurement."""
+def test_the_time_of_a_command_includes_its_children() -> None:
+    """The CPU time of a grandchild counts; a failing command gives no measurement."""
     parent = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {BUSY!r}], check=True)"
     timing = timed([sys.executable, "-c", parent])
     assert timing.cpu_s >= 0.2
@@ -248,8 +248,8 @@ def test_the_time_of_a_command_holds_that_of_its_children() -> None:
         timed([sys.executable, "-c", "raise SystemExit(3)"])
 
 
-def test_the_quickest_try_of_a_command_counts() -> None:
-    """Against what is asked of it."""
+def test_the_fastest_of_several_runs_of_a_command_counts() -> None:
+    """Its time is compared with the target; a failed command is reported with its exit code."""
     tries = [Timing(4.0, 3.0, 1.0), Timing(2.0, 1.5, 0.1), Timing(2.5, 1.0, 0.0)]
     row = commands.record("inspect", "inspect, 600 s", tries, 5.0)
     assert (row["wall_s"], row["cpu_s"], row["part_of_asked"], row["cpu_part_of_asked"]) == (2.0, 1.5, 0.4, 0.3)
@@ -262,8 +262,8 @@ def test_the_quickest_try_of_a_command_counts() -> None:
 # ── a looped capture ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_looped_capture_repeats_its_pictures_exactly(tmp_path: Path) -> None:
-    """Packets are copied: every group of thirty starts with a key frame and decodes to the same pictures."""
+def test_a_looped_capture_repeats_its_frames_exactly(tmp_path: Path) -> None:
+    """Packets are copied: every group of 30 starts with a key frame and decodes to the same frames."""
     folder = looped_capture(tmp_path, 75, 160, 120)
     index = probe_movie(folder / "movie.mp4")
     assert len(index) == 75
@@ -281,7 +281,7 @@ def test_a_looped_capture_repeats_its_pictures_exactly(tmp_path: Path) -> None:
 
 
 def command_facts(seconds: float) -> Facts:
-    """What the section ``commands`` gives of one command."""
+    """What the section ``commands`` returns for one command."""
     return {"commands": [commands.record("help", "virest --help", [Timing(seconds, 0.2, 0.0)], 0.3)]}
 
 
@@ -296,8 +296,8 @@ def met(given: Facts) -> dict[str, str]:
     return {row.figure: row.met for row in summary.summary_rows(given)}
 
 
-def test_the_summary_judges_what_is_asked_and_nothing_else() -> None:
-    """Each target beside its figure: some are met here, some are not, and some ask for nothing."""
+def test_the_summary_compares_each_figure_with_its_target() -> None:
+    """Some targets are met, some are missed, and figures without a target show a dash."""
     found = met(report(speed=speed_facts(), growth=growth_facts(), memory=memory_facts(), commands=command_facts(0.31)))
     assert found["fast: of the floor"] == "NO"
     assert found["balanced: of the floor"] == "-"
@@ -325,23 +325,23 @@ def test_the_summary_judges_what_is_asked_and_nothing_else() -> None:
         (False, False, 1.2, True, "NO"),
     ],
 )
-def test_a_busy_machine_is_judged_only_where_it_can_be(
+def test_on_a_busy_machine_only_conclusive_figures_are_judged(
     by_wall: bool, by_cpu: bool, others_cores: float, ratio: bool, said: str
 ) -> None:
-    """Good enough in spite of others is good enough, too slow by CPU time is too slow, and the rest stays open."""
+    """A target met despite other load is met, a target missed by CPU time is missed, and the rest stays open."""
     assert summary.judge(by_wall, by_cpu, others_cores, ratio=ratio) == said
 
 
-def test_the_summary_has_only_what_was_run() -> None:
-    """A section that did not run has no row; where nothing asked for anything ran, there is no summary."""
+def test_the_summary_lists_only_sections_that_ran() -> None:
+    """A section that did not run has no row; without any section that has targets, there is no summary."""
     text = summary.summary_text(report(memory=memory_facts()))
     assert "260 MB" in text
     assert "frames/s" not in text
     assert summary.summary_text(report(shutter={"captures": []})) == ""
 
 
-def test_the_summary_names_peers_that_are_not_there() -> None:
-    """With the way to get them."""
+def test_the_summary_names_missing_peers() -> None:
+    """A missing peer is listed with its install command."""
     text = summary.summary_text(report(speed=speed_facts()))
     assert "scikit-image wiener / deblur stage" in text
     assert "pip install 'virest[peers]'" in text
@@ -355,8 +355,8 @@ def changes(old: Facts, new: Facts, noise: float = compare.NOISE) -> dict[str, c
     return {change.name: change for change in compare.compared(report(**old), report(**new), noise)}
 
 
-def test_a_figure_is_compared_with_its_namesake_not_with_its_place() -> None:
-    """Lists of records may grow or change their order."""
+def test_figures_are_matched_by_name_and_not_by_position() -> None:
+    """Lists of records may grow or be reordered."""
     old = {"speed": {"presets": [{"preset": "fast", "s_per_frame": 0.2}, {"preset": "best", "s_per_frame": 4.0}]}}
     new = {"speed": {"presets": [{"preset": "best", "s_per_frame": 2.0}, {"preset": "new", "s_per_frame": 9.0},
                                  {"preset": "fast", "s_per_frame": 0.3}]}}  # fmt: skip
@@ -384,21 +384,24 @@ def test_a_figure_is_compared_with_its_namesake_not_with_its_place() -> None:
     ],
 )
 def test_a_change_beyond_the_noise_is_marked_by_its_direction(name: str, old: float, new: float, mark: str) -> None:
-    """Times by ratio, memory more closely, decibels by difference; what has no better direction has only changed."""
+    """Times are compared by ratio, memory with a tighter limit, decibels by difference.
+
+    A figure without a better direction is marked as changed.
+    """
     (change,) = changes({"some": {name: old}}, {"some": {name: new}}).values()
     assert change.mark == mark
     assert change.ratio == (None if old == 0 else pytest.approx(new / old))
 
 
-def test_the_noise_can_be_stated() -> None:
-    """What is within it is not marked."""
+def test_the_noise_level_can_be_set() -> None:
+    """A change within the given noise is not marked."""
     old, new = {"some": {"wall_s": 10.0}}, {"some": {"wall_s": 13.0}}
     assert changes(old, new, 0.5)["some.wall_s"].mark == ""
     assert changes(old, new, 0.1)["some.wall_s"].mark == "worse"
 
 
-def test_other_machines_versions_and_scales_are_said() -> None:
-    """And sections that only one report has; what is equal is not repeated."""
+def test_differences_of_machine_version_and_scale_are_reported() -> None:
+    """So are sections that only one report has and other load during the run; equal entries are not repeated."""
     old, new = report(memory=memory_facts()), report(commands=command_facts(0.2))
     new["versions"] = {**new["versions"], "numpy": "2.1", "load": 3.0}
     new["scale"] = "usual"
@@ -415,8 +418,8 @@ def test_other_machines_versions_and_scales_are_said() -> None:
     assert "new commands: other processes kept 1.2 cores busy" in compare.compare_text(old, new)
 
 
-def test_a_report_is_the_same_as_itself() -> None:
-    """Everything of every section is a figure with ratio 1 and without a mark; words and answers are none."""
+def test_a_report_compared_with_itself_shows_no_change() -> None:
+    """Every figure of every section has ratio 1 and no mark; words, targets and verdicts are not compared."""
     whole = report(speed=speed_facts(), growth=growth_facts(), memory=memory_facts(), commands=command_facts(0.2))
     found = compare.compared(whole, json.loads(json.dumps(whole)))
     names = {change.name for change in found}
@@ -432,7 +435,7 @@ def test_a_report_is_the_same_as_itself() -> None:
 
 
 def test_two_reports_are_compared_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Nothing is measured, nothing is written."""
+    """Nothing is measured and nothing is written."""
     paths = [tmp_path / name for name in ("old.json", "new.json")]
     for path, seconds in zip(paths, (0.2, 0.4), strict=True):
         path.write_text(json.dumps(report(commands=command_facts(seconds))))
@@ -443,17 +446,17 @@ def test_two_reports_are_compared_from_the_command_line(tmp_path: Path, capsys: 
     assert not (tmp_path / "none").exists()
 
 
-def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
-    """Any other JSON."""
+def test_a_file_that_is_not_a_report_is_rejected(tmp_path: Path) -> None:
+    """Any other JSON raises an error."""
     (tmp_path / "run.json").write_text('{"virest_run": 1}')
     with pytest.raises(ValueError, match="not a report"):
         compare.read_report(tmp_path / "run.json")
 
 
-def test_a_section_is_printed_kept_and_summed_up(
+def test_a_section_is_printed_saved_and_summarised(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The table closes what is printed; bench.json holds the figures, the versions and the commit."""
+    """The summary is printed last; bench.json holds the figures, the versions and the commit."""
 
     def fake(_work: Path, scale: Scale) -> tuple[Facts, str]:
         return command_facts(0.2), f"TOLD {scale.name}"
@@ -468,8 +471,8 @@ def test_a_section_is_printed_kept_and_summed_up(
     assert [path.name for path in tmp_path.iterdir()] == ["bench.json"]
 
 
-def test_the_quality_table_sums_up_only_kinds_of_several_captures() -> None:
-    """A kind with one capture has one row; the worst frames stand in a table of their own."""
+def test_the_quality_table_averages_only_kinds_with_several_captures() -> None:
+    """A kind with one capture has one row; the worst frames have a table of their own."""
     gains = {method: 1.0 if method in quality.PRESETS else -1.0 for method in quality.METHODS}
     frames = [("leaves", "ordinary"), ("phone-calm", "phone"), ("phone-fast", "phone")]
     rows = [{"capture": name, "kind": kind, "frame": 0, "in_range": True, "straightened_db": 20.0,

@@ -1,4 +1,4 @@
-"""``virest calibrate`` as its users meet it: tables, JSON, files and exit codes."""
+"""``virest calibrate`` as users see it: tables, JSON, files and exit codes."""
 
 import json
 import os
@@ -35,7 +35,7 @@ HIDDEN = [
 ]
 TRUTH = {"time_offset_s": OFFSET_S, "readout_time_s": READOUT_S, "rotation_rad": ROTATION, "gyro_bias_rad_s": BIAS}
 UNITS = {"time_offset_s": 2e-3, "readout_time_s": 2e-3, "rotation_rad": 6e-3, "gyro_bias_rad_s": 6e-3}
-"""No error may be larger, however large its standard deviation."""
+"""Upper limit of each error, whatever its standard deviation."""
 
 
 @pytest.fixture(scope="session")
@@ -48,20 +48,20 @@ def _shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def shaken(_shaken: Path, tmp_path: Path) -> Path:
-    """Two seconds of a shaken camera with offset, readout, axes and bias hidden; the test may damage it."""
+    """Two seconds of a shaken camera with hidden offset, readout time, axes and bias; the test may damage it."""
     return Path(shutil.copytree(_shaken, tmp_path / "shaken", ignore=shutil.ignore_patterns("truth")))
 
 
 @pytest.fixture(scope="session")
 def done(_shaken: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], str]:
-    """One calibration of it that several tests look at: (folder written to, JSON mapping, text)."""
+    """One calibration of this capture that several tests share: (folder written to, JSON mapping, text)."""
     folder = tmp_path_factory.mktemp("results")
     output = CalibrationOutput(folder / "camera.yaml", folder / "kalibr")
     return folder, *run_calibration(plan_calibration(_shaken), output)
 
 
 def start_profile(capture: Path, **changes: Any) -> CameraProfile:
-    """Read the capture's own profile with some keys of its YAML changed, ``section__key``."""
+    """Read the capture's own profile after changing some keys of its YAML, given as ``section__key``."""
     content = yaml.safe_load((capture / "camera.yaml").read_text())
     for name, value in changes.items():
         section, key = name.split("__")
@@ -76,7 +76,7 @@ def value_of(facts: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def assert_recovered(facts: dict[str, Any]) -> None:
-    """Every hidden value lies within four standard deviations, and absolutely near."""
+    """Every hidden value lies within four standard deviations and within an absolute limit."""
     for name, truth in TRUTH.items():
         found = value_of(facts, name)
         error = np.abs(np.array(found["value"]) - truth)
@@ -86,7 +86,7 @@ def assert_recovered(facts: dict[str, Any]) -> None:
 
 
 def assert_refused(result: "subprocess.CompletedProcess[str]", code: int, *says: str) -> None:
-    """One line for the error, the right exit code, and nothing on standard output."""
+    """Standard error has one error line, the exit code is right, and standard output is empty."""
     errors = [line for line in result.stderr.splitlines() if line.startswith("virest: error: ")]
     assert result.returncode == code, result.stderr
     assert len(errors) == 1, result.stderr
@@ -96,8 +96,8 @@ def assert_refused(result: "subprocess.CompletedProcess[str]", code: int, *says:
         assert text in errors[0]
 
 
-def test_what_was_hidden_is_found(done: tuple[Path, dict[str, Any], str]) -> None:
-    """Offset, readout, axes and bias come back within their standard deviations, and the residual is tracking's own."""
+def test_hidden_values_are_recovered(done: tuple[Path, dict[str, Any], str]) -> None:
+    """Offset, readout time, axes and bias match the truth; the residual is close to the tracking noise."""
     _, facts, _ = done
     assert_recovered(facts)
     assert value_of(facts, "readout_direction")["value"] == "top_to_bottom"
@@ -106,7 +106,7 @@ def test_what_was_hidden_is_found(done: tuple[Path, dict[str, Any], str]) -> Non
 
 
 def test_the_program_prints_one_json_object_and_writes_the_profile(virest: Virest, shaken: Path) -> None:
-    """``--json`` is one object with every key; the profile of the object is the file's; nothing else is written."""
+    """``--json`` prints one object with every key; its profile matches the written file; nothing else is written."""
     result = virest("calibrate", "shaken", "--json", "--out", "found.yaml", cwd=shaken.parent)
     assert result.returncode == 0, result.stderr
     facts = json.loads(result.stdout)
@@ -120,10 +120,10 @@ def test_the_program_prints_one_json_object_and_writes_the_profile(virest: Vires
     assert set(profile.estimates) >= {*TRUTH, "readout_direction"}
 
 
-def test_two_processes_find_what_one_does(
+def test_two_processes_give_the_same_values_as_one(
     virest_here: Virest, shaken: Path, done: tuple[Path, dict[str, Any], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The program shares its work out over the cores it may use; the digits stay."""
+    """Dividing the work over the available cores does not change a digit of the result."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
     monkeypatch.setattr(tracking, "PART_FRAMES", 30)
     result = virest_here("calibrate", shaken, "--json", "--out", "found.yaml")
@@ -132,7 +132,7 @@ def test_two_processes_find_what_one_does(
 
 
 def test_the_written_profile_reads_back_with_its_estimates(done: tuple[Path, dict[str, Any], str]) -> None:
-    """A number, a list and a word of ``estimates`` survive the file, and writing the profile again changes nothing."""
+    """Numbers, lists and words in ``estimates`` survive the file, and writing the profile again changes nothing."""
     folder, facts, _ = done
     profile = read_profile(folder / "camera.yaml")
     assert profile.estimates["readout_direction"].value == "top_to_bottom"
@@ -142,13 +142,13 @@ def test_the_written_profile_reads_back_with_its_estimates(done: tuple[Path, dic
         assert written.source
     write_profile(profile, folder / "again.yaml")
     again = read_profile(folder / "again.yaml")
-    # a rotation is made orthogonal when it is read, which changes its last digit
+    # reading a rotation orthogonalises it, which changes its last digit
     np.testing.assert_allclose(again.rotation_cam_imu, profile.rotation_cam_imu, atol=1e-14)
     assert replace(again, r_cam_imu=profile.r_cam_imu) == profile
 
 
-def test_people_read_a_table(done: tuple[Path, dict[str, Any], str]) -> None:
-    """Each value has a row, each component of a list too; then residuals, translation and the files."""
+def test_the_text_output_is_a_table(done: tuple[Path, dict[str, Any], str]) -> None:
+    """Each value and each component of a list has a row; residuals, translation and written files follow."""
     folder, facts, text = done
     lines = text.splitlines()
     assert lines[0] == "shaken: calibrated"
@@ -162,8 +162,8 @@ def test_people_read_a_table(done: tuple[Path, dict[str, Any], str]) -> None:
     assert lines[-1] == f"wrote {folder / 'kalibr' / 'imu.yaml'}"
 
 
-def test_what_is_not_determined_is_said_and_stays(done: tuple[Path, dict[str, Any], str]) -> None:
-    """A value that is not determined has no calibrated number in the table; correlations are named."""
+def test_an_undetermined_value_is_reported_and_kept(done: tuple[Path, dict[str, Any], str]) -> None:
+    """The table shows no calibrated number for an undetermined value; correlated values are named."""
     _, facts, _ = done
     open_value = {"name": "fx_px", "start": 500.0, "value": 500.0, "std": 44.0, "determined": False, "note": ""}
     pair = {"first": "fx_px", "second": "gyro_scale", "correlation": -0.97}
@@ -179,8 +179,8 @@ def test_what_is_not_determined_is_said_and_stays(done: tuple[Path, dict[str, An
     assert "fx_px and gyro_scale are correlated: -0.97" in text
 
 
-def test_kalibr_gets_its_files(done: tuple[Path, dict[str, Any], str]) -> None:
-    """The camera chain reads back as the same lens, axes, offset and readout; imu.yaml holds the capture's noise."""
+def test_the_kalibr_files_describe_the_same_camera(done: tuple[Path, dict[str, Any], str]) -> None:
+    """The camera chain reads back as the same camera; imu.yaml holds the capture's noise."""
     folder, _, _ = done
     ours, chain = read_profile(folder / "camera.yaml"), read_any_profile(folder / "kalibr" / "camchain-imucam.yaml")
     assert chain.intrinsics == ours.intrinsics
@@ -193,8 +193,8 @@ def test_kalibr_gets_its_files(done: tuple[Path, dict[str, Any], str]) -> None:
     assert noise["accelerometer_noise_density"] == pytest.approx(0.02 / np.sqrt(200), rel=0.25)
 
 
-def test_an_offset_that_is_null_is_found(shaken: Path, tmp_path: Path) -> None:
-    """A profile that knows neither offset nor readout gets both."""
+def test_a_null_offset_is_estimated(shaken: Path, tmp_path: Path) -> None:
+    """A profile with neither offset nor readout time gets both."""
     start_profile(shaken, imu__time_offset_s=None, shutter__readout_time_s=None)
     facts, text = run_calibration(plan_calibration(shaken), CalibrationOutput(tmp_path / "c.yaml"))
     assert value_of(facts, "time_offset_s")["start"] is None
@@ -203,8 +203,11 @@ def test_an_offset_that_is_null_is_found(shaken: Path, tmp_path: Path) -> None:
     assert abs(facts["profile"]["shutter"]["readout_time_s"] - READOUT_S) < UNITS["readout_time_s"]
 
 
-def test_config_comes_before_the_capture_s_own_profile(shaken: Path, tmp_path: Path) -> None:
-    """Values start where ``--config`` says, here at 300 ms and another focal length that is asked for."""
+def test_config_overrides_the_capture_s_own_profile(shaken: Path, tmp_path: Path) -> None:
+    """Starting values come from ``--config``.
+
+    Here an offset of 300 ms and another focal length, which is calibrated too.
+    """
     content = yaml.safe_load((shaken / "camera.yaml").read_text())
     true_px = content["intrinsics"]["fx_px"]
     content["imu"]["time_offset_s"], content["intrinsics"]["fx_px"], content["intrinsics"]["fy_px"] = 0.3, 270.0, 270.0
@@ -218,8 +221,8 @@ def test_config_comes_before_the_capture_s_own_profile(shaken: Path, tmp_path: P
     assert_recovered(facts)
 
 
-def test_a_focal_length_that_makes_up_for_a_gyroscope_s_scale_is_said(shaken: Path, tmp_path: Path) -> None:
-    """Turns about the optical axis tell the two apart: a scale 2 % too high is not made good by the lens in silence."""
+def test_a_focal_length_that_absorbs_a_gyroscope_scale_error_is_reported(shaken: Path, tmp_path: Path) -> None:
+    """Roll about the optical axis separates the two: a scale 2 % too high gives a note, a correct scale gives none."""
     for scale, said in ((1.02, True), (1.0, False)):
         start_profile(shaken, imu__gyro_scale=[scale] * 3)
         output = CalibrationOutput(tmp_path / f"{scale}.yaml")
@@ -231,8 +234,11 @@ def test_a_focal_length_that_makes_up_for_a_gyroscope_s_scale_is_said(shaken: Pa
             assert float(notes[0].split("gyro-scale (")[1].split("%")[0]) == pytest.approx(-1.96, abs=0.4)
 
 
-def test_a_wrong_fixed_focal_length_is_blamed_and_not_the_motion(shaken: Path, tmp_path: Path) -> None:
-    """Half the focal length leaves a residual that hides the other values; what is said leads to the cause."""
+def test_a_wrong_fixed_focal_length_is_reported_as_the_cause(shaken: Path, tmp_path: Path) -> None:
+    """Half the focal length leaves a residual that hides the other values.
+
+    The verdict and the notes name the focal length, not the motion.
+    """
     true_px = read_profile(shaken / "camera.yaml").intrinsics.fx_px
     start_profile(shaken, intrinsics__fx_px=0.5 * true_px, intrinsics__fy_px=0.5 * true_px)
     facts, _ = run_calibration(plan_calibration(shaken), CalibrationOutput(tmp_path / "camera.yaml"))
@@ -244,8 +250,8 @@ def test_a_wrong_fixed_focal_length_is_blamed_and_not_the_motion(shaken: Path, t
     assert not any("record a few more seconds" in note for note in facts["notes"])
 
 
-def test_a_value_that_no_phone_has_is_no_finding(shaken: Path, tmp_path: Path) -> None:
-    """Rates logged 1.3 times too large are well determined, and still no gyroscope's scale: nothing is taken over."""
+def test_an_implausible_value_is_not_adopted(shaken: Path, tmp_path: Path) -> None:
+    """Rates logged 1.3 times too large determine a gyroscope scale that is implausible and is not adopted."""
     table = shaken / "gyro_accel.csv"
     head, *rows = table.read_text().splitlines()
     fields = [row.split(",") for row in rows]
@@ -263,10 +269,10 @@ def test_a_value_that_no_phone_has_is_no_finding(shaken: Path, tmp_path: Path) -
     assert "no camera has it" in text
 
 
-def test_what_another_sensor_s_imu_yaml_says_is_compared(
+def test_an_imu_yaml_with_another_rate_is_reported(
     done: tuple[Path, dict[str, Any], str], shaken: Path, tmp_path: Path
 ) -> None:
-    """Beside a camera chain, imu.yaml of another rate and a tenth of the noise is noticed."""
+    """An imu.yaml beside the camera chain that states 125 Hz instead of 200 Hz gives a note."""
     folder, _, _ = done
     for name in ("camchain-imucam.yaml", "imu.yaml"):
         text = (folder / "kalibr" / name).read_text()
@@ -276,8 +282,10 @@ def test_what_another_sensor_s_imu_yaml_says_is_compared(
     assert [note for note in facts["notes"] if "125 Hz" in note and "200 Hz" in note]
 
 
-def test_long_captures_are_looked_at_in_runs(shaken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beyond the limit, runs of consecutive frames spread over the capture are tracked, and that is enough."""
+def test_a_long_capture_is_sampled_in_runs_of_frames(
+    shaken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Above the frame limit, runs of consecutive frames spread over the capture suffice for the calibration."""
     monkeypatch.setattr(command, "MAX_FRAMES", 40)
     monkeypatch.setattr(frame_selection, "MIN_RUN_FRAMES", 10)
     monkeypatch.setattr(frame_selection, "RUN_S", 0.33)
@@ -297,15 +305,15 @@ def test_long_captures_are_looked_at_in_runs(shaken: Path, tmp_path: Path, monke
     assert_recovered(facts)
 
 
-def test_names_of_with_are_those_that_the_library_takes() -> None:
-    """The help, the command and the library name the same; a slip is answered with its nearest neighbour."""
+def test_the_names_of_with_match_the_library() -> None:
+    """The command and the library accept the same names; the error for a misspelt name suggests the nearest one."""
     assert set(command.EXTRA_NAMES) == set(CALIBRATED_EXTRAS)
     assert unknown_extra("clock-skew") is None
     assert "'focal'" in str(unknown_extra("focl"))
     assert "'principal-point'" in str(unknown_extra("principal_point"))
 
 
-def test_refusals_are_one_line_with_their_code(virest: Virest, shaken: Path) -> None:
+def test_errors_are_one_line_with_their_exit_code(virest: Virest, shaken: Path) -> None:
     """Usage 2, profile 3, capture 4, output 8: one line, nothing on standard output, nothing written."""
     folder = shaken.parent
     (folder / "bad.yaml").write_text("virest_profile: 1\nimage: {width: 320, hight: 240}\n")
@@ -327,16 +335,16 @@ def test_refusals_are_one_line_with_their_code(virest: Virest, shaken: Path) -> 
     assert sorted(p.name for p in folder.iterdir()) == before
 
 
-def test_a_capture_that_determines_nothing_ends_with_6_and_leaves_no_file(virest: Virest, tmp_path: Path) -> None:
-    """A camera on a tripod: one line that says what to do, and no profile."""
+def test_a_capture_that_determines_nothing_exits_with_6_and_writes_no_file(virest: Virest, tmp_path: Path) -> None:
+    """For a camera on a tripod, one line says what to do, and no profile is written."""
     simulate_command(tmp_path / "still", width=320, height=240, frames=20, rate_rad_s=0.0, seed=4)
     result = virest("calibrate", "still", "--json", cwd=tmp_path)
     assert_refused(result, 6, "shake the phone")
     assert [p.name for p in tmp_path.iterdir()] == ["still"]
 
 
-def test_an_existing_profile_is_replaced_only_on_demand(shaken: Path, tmp_path: Path) -> None:
-    """Without overwrite the old file stays as it is; with it the new one stands there whole."""
+def test_an_existing_profile_is_replaced_only_on_request(shaken: Path, tmp_path: Path) -> None:
+    """Without ``overwrite`` the old file stays as it is; with it the new file replaces it completely."""
     taken = tmp_path / "camera.yaml"
     taken.write_text("mine\n")
     plan = plan_calibration(shaken)
@@ -349,7 +357,7 @@ def test_an_existing_profile_is_replaced_only_on_demand(shaken: Path, tmp_path: 
 
 
 def test_nothing_is_written_when_the_fit_fails(shaken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error of the library leaves neither profile nor Kalibr's folder."""
+    """An error of the library leaves neither a profile nor Kalibr's folder."""
 
     def refuse(*_: Any) -> None:
         raise CalibrationError("the frames do not follow the gyroscope")
@@ -361,7 +369,7 @@ def test_nothing_is_written_when_the_fit_fails(shaken: Path, tmp_path: Path, mon
 
 
 def test_start_up_frames_are_left_out_of_the_fit(shaken: Path) -> None:
-    """Frames whose pictures are later than their stamps are looked at only where the lag itself is fitted."""
+    """Frames that lag their timestamps at start-up are used only if the lag itself is fitted."""
     capture = read_capture(shaken)
     profile = read_profile(shaken / "camera.yaml")
     late = [replace(f, skip_reason="later", skip_codes=("start-up",)) if f.index < 7 else f for f in capture.frames]

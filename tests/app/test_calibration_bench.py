@@ -1,4 +1,4 @@
-"""Errors of calibrations over their deviations: what is drawn, compared, summed up and shown."""
+"""Calibration errors in standard deviations: drawing captures, and comparing, summarising and plotting errors."""
 
 from __future__ import annotations
 
@@ -18,8 +18,11 @@ def _row(ratio: float, shared: float = 0.5) -> dict[str, object]:
     return {"value": "k1", "error": ratio, "std": 1.0, "shared_std": shared, "error_in_std": ratio}
 
 
-def test_errors_are_summed_up() -> None:
-    """Median, part within two, mean, bars; a share that would make the median usual."""
+def test_errors_are_summarised() -> None:
+    """The summary gives median, part within two deviations, mean and histogram.
+
+    It also gives the shared part at which the median would be that of a normal distribution.
+    """
     one = calibration.summed([_row(ratio) for ratio in (-2.5, -0.5, 0.5, 1.5)])
     assert (one["count"], one["median"], one["within_two"], one["mean"]) == (4, 1.0, 0.75, -0.25)
     assert one["histogram"] == [0, 1, 0, 1, 1, 1, 0, 0]
@@ -30,8 +33,8 @@ def test_errors_are_summed_up() -> None:
     np.testing.assert_allclose(shares, expected, rtol=0.15)
 
 
-def test_a_table_and_a_figure_come_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One capture a seed, from the first that nobody looked at; refused captures leave no row."""
+def test_the_section_writes_a_table_and_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each seed from the first reserved one gives one capture; rejected captures leave no row."""
     seeds: list[int] = []
 
     def rows(_work: Path, seed: int) -> list[dict[str, object]]:
@@ -46,8 +49,8 @@ def test_a_table_and_a_figure_come_of_it(tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / calibration.FIGURE).read_bytes().startswith(b"\x89PNG")
 
 
-def test_captures_differ_and_are_repeated() -> None:
-    """A seed always draws the same; over seeds all kinds are drawn."""
+def test_drawn_captures_vary_and_are_reproducible() -> None:
+    """A seed always draws the same capture; many seeds cover all kinds."""
     assert calibration.drawn_capture(7) == calibration.drawn_capture(7)
     drawn = [calibration.drawn_capture(seed) for seed in range(60)]
     assert {taken["scene"] for taken, _, _ in drawn} == set(calibration.SCENES)
@@ -58,7 +61,7 @@ def test_captures_differ_and_are_repeated() -> None:
 
 @pytest.fixture(scope="module")
 def wrong_lens(tmp_path_factory: pytest.TempPathFactory) -> tuple[GeometryCalibration, Path]:
-    """A far scene through a lens that the profile has wrong, calibrated with what is wrong."""
+    """A distant scene through a lens that the profile has wrong, calibrated with focal length and distortion."""
     folder = tmp_path_factory.mktemp("lens") / "capture"
     hidden = ("time_offset=0.006", "focal_length=0.94", "radial_distortion=-0.1")
     simulate_command(
@@ -69,14 +72,14 @@ def wrong_lens(tmp_path_factory: pytest.TempPathFactory) -> tuple[GeometryCalibr
 
 
 @pytest.mark.scenario
-def test_a_wrong_lens_is_not_taken_for_travel(wrong_lens: tuple[GeometryCalibration, Path]) -> None:
-    """Points that the lens explains need no translation."""
+def test_a_wrong_lens_is_not_mistaken_for_translation(wrong_lens: tuple[GeometryCalibration, Path]) -> None:
+    """Motion that the lens explains needs no translation."""
     assert wrong_lens[0].translation == "none"
 
 
 @pytest.mark.scenario
 def test_each_value_comes_with_its_error(wrong_lens: tuple[GeometryCalibration, Path]) -> None:
-    """All that was asked for, in the profile's units, and within four deviations."""
+    """Every requested value is listed in the profile's units and lies within four deviations of the truth."""
     found, folder = wrong_lens
     rows = calibration.errors_of(found, read_profile(folder / "truth" / "camera.yaml"))
     assert {"time_offset_s", "readout_time_s", "rotation_rad", "gyro_bias_rad_s", "fx_px"} <= {r["value"] for r in rows}

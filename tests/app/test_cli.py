@@ -1,4 +1,4 @@
-"""The program as its users meet it: exit codes, one line for an error, results on standard output only."""
+"""The program as users see it: exit codes, one line for an error, and results only on standard output."""
 
 import errno
 import itertools
@@ -31,7 +31,7 @@ def below(folder: Path) -> set[str]:
 
 
 def assert_refused(result: "subprocess.CompletedProcess[str]", code: int, *says: str) -> None:
-    """One line for the error, the right exit code, nothing on standard output, and no traceback."""
+    """One error line, the right exit code, nothing on standard output, and no traceback."""
     errors = [line for line in result.stderr.splitlines() if line.startswith("virest: error: ")]
     assert result.returncode == code, result.stderr
     assert len(errors) == 1, result.stderr
@@ -42,7 +42,7 @@ def assert_refused(result: "subprocess.CompletedProcess[str]", code: int, *says:
 
 
 def wait_for(condition: Callable[[], bool], process: "subprocess.Popen[str]", seconds: float = 60) -> None:
-    """Wait until a condition holds, while a process runs."""
+    """Wait until a condition holds while a process runs."""
     end = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.communicate()
@@ -52,9 +52,9 @@ def wait_for(condition: Callable[[], bool], process: "subprocess.Popen[str]", se
 
 @pytest.fixture
 def start(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
-    """Start the program in a process group of its own, as a terminal does.
+    """Start the program in its own process group, as a terminal does.
 
-    A shell's background jobs ignore Ctrl-C, and so would what the tests start from one: a terminal's programs do not.
+    A shell's background jobs ignore Ctrl-C, and so would programs that a test starts from such a job.
     """
 
     def popen(*arguments: object) -> "subprocess.Popen[str]":
@@ -71,7 +71,7 @@ def start(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
 
 
 def test_help_imports_nothing_heavy() -> None:
-    """`virest --help` answers at once: no numpy, no OpenCV, no PyAV."""
+    """``virest --help`` answers at once: it loads no numpy, OpenCV or PyAV."""
     program = (
         "import sys; from virest.app.cli import run; code = run(['--help']);"
         "print(code, sorted({'numpy', 'cv2', 'av', 'scipy', 'pandas', 'pydantic', 'rich'} & set(sys.modules)))"
@@ -91,15 +91,15 @@ def test_help_imports_nothing_heavy() -> None:
     ],
 )
 def test_help_names_arguments_as_manual_pages_do(words: str, usage: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """NAME, [NAME] where it may be left out, NAME... where there may be several, and no Python types."""
+    """NAME is required, [NAME] is optional, NAME... may be repeated, and no Python types appear."""
     assert run([*words.split(), "--help"]) == 0
     shown = capsys.readouterr().out
     assert f"Usage: virest {words} {usage}\n" in shown
     assert "<" not in shown.split("Arguments:")[1].split("Options:")[0]
 
 
-def test_help_of_a_group_cuts_no_description(capsys: pytest.CaptureFixture[str]) -> None:
-    """Each command's line is whole on a terminal of 80 columns."""
+def test_help_of_a_group_truncates_no_description(capsys: pytest.CaptureFixture[str]) -> None:
+    """Each command's line fits a terminal of 80 columns."""
     for group in ([], ["evaluate"], ["profile"]):
         run([*group, "--help"])
         assert "..." not in capsys.readouterr().out.split("Commands:")[1]
@@ -121,15 +121,15 @@ def test_help_of_a_group_cuts_no_description(capsys: pytest.CaptureFixture[str])
         (["inspect", "--deep", "x"], "--deep"),
     ],
 )
-def test_a_wrong_call_is_one_line_and_exit_2(virest: Virest, arguments: list[str], says: str) -> None:
-    """The line says what was wrong and where the help is."""
+def test_a_usage_error_prints_one_line_and_exits_with_2(virest: Virest, arguments: list[str], says: str) -> None:
+    """The line names the error and points to the help."""
     result = virest(*arguments)
     assert_refused(result, 2, says, "--help")
     assert len(result.stderr.splitlines()) == 1
 
 
 def test_a_scheduler_needs_its_extra(virest: Virest) -> None:
-    """Without Dask, --scheduler says how to get it."""
+    """Without Dask, ``--scheduler`` names the extra to install."""
     program = (
         "import sys; sys.modules['distributed'] = None; from virest.app.cli import run; sys.exit(run(sys.argv[1:]))"
     )
@@ -138,7 +138,7 @@ def test_a_scheduler_needs_its_extra(virest: Virest) -> None:
 
 
 def test_version_goes_to_standard_output(virest: Virest) -> None:
-    """Everywhere where it is asked for."""
+    """``--version`` works for the program and for each command."""
     for arguments in (["--version"], ["process", "--version"], ["inspect", "--version"]):
         result = virest(*arguments)
         assert (result.returncode, result.stderr) == (0, "")
@@ -146,7 +146,7 @@ def test_version_goes_to_standard_output(virest: Virest) -> None:
 
 
 def test_a_closed_pipe_ends_the_program_quietly() -> None:
-    """`virest --help | head -0` complains of nothing."""
+    """``virest --help | head -0`` prints no error."""
     read, write = os.pipe()
     os.close(read)
     result = subprocess.run(
@@ -157,7 +157,7 @@ def test_a_closed_pipe_ends_the_program_quietly() -> None:
 
 
 def test_a_full_standard_output_is_an_output_error(virest: Virest) -> None:
-    """Results that cannot be written are not done."""
+    """A result that cannot be written gives exit code 8."""
     if not os.path.exists("/dev/full"):
         pytest.skip("no /dev/full here")
     with open("/dev/full", "wb") as full:
@@ -170,8 +170,8 @@ def test_a_full_standard_output_is_an_output_error(virest: Virest) -> None:
 # ── a good run ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_process_writes_pictures_parameters_and_run(virest: Virest, tiny: Path, tmp_path: Path) -> None:
-    """The files of the contract, and nothing else; a table on standard output."""
+def test_process_writes_frames_parameters_and_run(virest: Virest, tiny: Path, tmp_path: Path) -> None:
+    """The command writes exactly the documented files and prints a table on standard output."""
     result = virest("process", tiny, "--out", "out", *FAST, "--frames", "2:5", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     pictures = {f"frames/{i:06d}.png" for i in (2, 3, 4)}
@@ -190,7 +190,7 @@ def test_process_writes_pictures_parameters_and_run(virest: Virest, tiny: Path, 
 
 
 def test_json_lines_are_the_parameters_and_nothing_else(virest: Virest, tiny: Path, tmp_path: Path) -> None:
-    """Names come from standard input; the lines come in frame order, for the program after the pipe."""
+    """Names come from standard input; the lines come in frame order, ready for the next program in a pipe."""
     result = virest("process", "-", "--out", "out", "--json", "--preset", "fast", "--jobs", 2, cwd=tmp_path,
                     stdin=f"{tiny}\n\n")  # fmt: skip
     assert result.returncode == 0, result.stderr
@@ -200,14 +200,14 @@ def test_json_lines_are_the_parameters_and_nothing_else(virest: Virest, tiny: Pa
     assert all(line["blur"]["length_px"] >= 0 for line in lines if line["status"] != "skipped")
 
 
-def test_quiet_is_quiet(virest: Virest, tiny: Path, tmp_path: Path) -> None:
-    """With -q a good run says nothing on standard error."""
+def test_quiet_prints_nothing_on_standard_error(virest: Virest, tiny: Path, tmp_path: Path) -> None:
+    """With ``-q`` a successful run prints nothing on standard error."""
     result = virest("process", tiny, "-q", *FAST, "--frames", ":1", cwd=tmp_path)
     assert (result.returncode, result.stderr) == (0, "")
 
 
 def test_a_dot_is_named_after_its_folder(virest: Virest, tiny: Path, tmp_path: Path) -> None:
-    """`cd capture; virest process .` writes OUT/<capture>."""
+    """``cd capture; virest process .`` writes OUT/<capture>."""
     result = virest("process", ".", "--out", tmp_path / "out", *FAST, "--frames", "0:1", cwd=tiny)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "out/tiny/run.json").is_file()
@@ -218,7 +218,7 @@ def test_a_dot_is_named_after_its_folder(virest: Virest, tiny: Path, tmp_path: P
     [("-2:", [22, 23]), ("20:900:3", [20, 23]), ("1:0:-1", [1]), ("::23", [0, 23]), ("30:", [])],
 )
 def test_frames_is_a_python_slice(virest: Virest, tiny: Path, tmp_path: Path, frames: str, chosen: list[int]) -> None:
-    """Ends are clipped, negative indices count from the end; nothing chosen is a warning."""
+    """Ends are clipped and negative indices count from the end; an empty selection gives a warning."""
     result = virest("process", tiny, "--json", "--deblur", "none", "--frames", frames, "--jobs", 1, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert [json.loads(line)["frame"] for line in result.stdout.splitlines()] == chosen
@@ -229,7 +229,7 @@ def test_frames_is_a_python_slice(virest: Virest, tiny: Path, tmp_path: Path, fr
 
 
 def refuse(virest: Virest, tiny: Path, code: int, *says: str) -> None:
-    """Process the damaged capture: refused in one line, which run.json repeats; nothing else is written."""
+    """Process a damaged capture: one error line, which run.json repeats, and no other output."""
     result = virest("process", tiny, "--out", tiny.parent / "out", *FAST)
     assert_refused(result, code, *says)
     assert below(tiny.parent / "out") == {"tiny", "tiny/run.json", "tiny/parameters.jsonl"}
@@ -241,7 +241,7 @@ def refuse(virest: Virest, tiny: Path, code: int, *says: str) -> None:
 
 
 def test_a_path_that_does_not_exist(virest: Virest, tmp_path: Path) -> None:
-    """Exit 4, and the path is named; a slip of the pen leaves nothing behind."""
+    """Exit 4, and the path is named; a single mistyped path writes nothing."""
     result = virest("process", tmp_path / "tiny", "--out", tmp_path / "out", *FAST)
     assert_refused(result, 4, "no such folder")
     assert not (tmp_path / "out").exists()
@@ -260,7 +260,7 @@ def test_no_movie(virest: Virest, tiny: Path) -> None:
 
 
 def test_a_movie_without_moov(virest: Virest, tiny: Path) -> None:
-    """A recording that was not stopped has no index."""
+    """A recording that was cut off has no index."""
     movie = tiny / "movie.mp4"
     data = movie.read_bytes()
     movie.write_bytes(data[: data.index(b"moov") - 4])
@@ -268,13 +268,13 @@ def test_a_movie_without_moov(virest: Virest, tiny: Path) -> None:
 
 
 def test_an_imu_that_does_not_cover_the_frames(virest: Virest, tiny: Path, edit_gyro: Edit) -> None:
-    """Nothing is left to process: exit 4."""
+    """No frame can be processed: exit 4."""
     edit_gyro(lambda rows: rows[:40])
     refuse(virest, tiny, 4, "gyro_accel.csv")
 
 
 def test_an_imu_that_covers_some_frames(virest: Virest, tiny: Path, edit_gyro: Edit) -> None:
-    """The frames outside are skipped with their reason, the others are done: exit 0."""
+    """Frames outside the IMU samples are skipped with a reason and the others are processed: exit 0."""
     edit_gyro(lambda rows: rows[130:])
     result = virest("process", tiny, "--json", *FAST, cwd=tiny.parent)
     assert result.returncode == 0, result.stderr
@@ -287,7 +287,7 @@ def test_an_imu_that_covers_some_frames(virest: Virest, tiny: Path, edit_gyro: E
 
 @pytest.mark.parametrize("damage", ["gap", "nan"])
 def test_a_hole_in_the_imu_skips_the_frames_inside(virest: Virest, tiny: Path, edit_gyro: Edit, damage: str) -> None:
-    """A gap, or samples that are no numbers: exit 0, the frames inside are skipped."""
+    """For a gap or NaN samples, the frames inside are skipped: exit 0."""
 
     def hole(rows: list[str]) -> list[str]:
         inside = range(150, 190)
@@ -304,7 +304,7 @@ def test_a_hole_in_the_imu_skips_the_frames_inside(virest: Virest, tiny: Path, e
 
 
 def test_swapped_files(virest: Virest, tiny: Path) -> None:
-    """Headers tell the files apart."""
+    """The files' headers reveal the swap."""
     (tiny / "gyro_accel.csv").rename(tiny / "x")
     (tiny / "movie_metadata.csv").rename(tiny / "gyro_accel.csv")
     (tiny / "x").rename(tiny / "movie_metadata.csv")
@@ -312,20 +312,20 @@ def test_swapped_files(virest: Virest, tiny: Path) -> None:
 
 
 def test_an_unknown_key_in_the_profile(virest: Virest, tiny: Path) -> None:
-    """Exit 3, and the nearest known key."""
+    """Exit 3, and the error suggests the nearest known key."""
     profile = tiny / "camera.yaml"
     profile.write_text(profile.read_text().replace("readout_time_s", "readout_s"))
     refuse(virest, tiny, 3, "readout_s", "readout_time_s")
 
 
 def test_a_profile_of_another_size(virest: Virest, tiny: Path) -> None:
-    """Exit 3, and both sizes."""
+    """Exit 3, and the error names both sizes."""
     profile = tiny / "camera.yaml"
     profile.write_text(profile.read_text().replace("160", "320"))
     refuse(virest, tiny, 3, "320", "160")
 
 
-def test_settings_that_cannot_be_used(virest: Virest, tiny: Path) -> None:
+def test_invalid_settings(virest: Virest, tiny: Path) -> None:
     """Exit 3, before any work."""
     (tiny.parent / "s.yaml").write_text("strenght: 2\n")
     result = virest("process", tiny, "--out", tiny.parent / "out", "--settings", tiny.parent / "s.yaml")
@@ -341,8 +341,8 @@ def test_a_profile_file_that_does_not_exist(virest: Virest, tiny: Path) -> None:
 # ── output ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_an_existing_run_is_refused_kept_and_replaced(virest: Virest, tiny: Path) -> None:
-    """Without --overwrite nothing is touched; --resume of a finished run is done; --overwrite starts anew."""
+def test_an_existing_run_is_protected_resumed_or_replaced(virest: Virest, tiny: Path) -> None:
+    """Without ``--overwrite`` nothing changes; ``--resume`` accepts a finished run; ``--overwrite`` starts anew."""
     arguments = ("process", tiny, "--out", tiny.parent / "out", *FAST, "--deblur", "none", "--frames")
     run = tiny.parent / "out/tiny"
     assert virest(*arguments, "0:3").returncode == 0
@@ -355,14 +355,14 @@ def test_an_existing_run_is_refused_kept_and_replaced(virest: Virest, tiny: Path
     assert {name for name in below(run) if name.endswith(".png")} == {"frames/000000.png", "frames/000001.png"}
 
 
-def test_other_captures_in_the_output_folder_are_no_obstacle(virest: Virest, tiny: Path) -> None:
-    """A run is OUT/<capture>."""
+def test_other_captures_in_the_output_folder_do_not_matter(virest: Virest, tiny: Path) -> None:
+    """A run occupies only OUT/<capture>."""
     (tiny.parent / "out/other/frames").mkdir(parents=True)
     assert virest("process", tiny, "--out", tiny.parent / "out", *FAST, "--frames", "0:1").returncode == 0
 
 
 def test_an_output_below_a_file_is_refused(virest: Virest, tiny: Path) -> None:
-    """Whether OUT is a file or lies below one."""
+    """OUT may neither be a file nor lie below one."""
     (tiny.parent / "file").write_text("mine")
     for out in ("file", "file/deeper"):
         result = virest("process", tiny, "--out", tiny.parent / out, *FAST, "--frames", "0:1")
@@ -372,7 +372,7 @@ def test_an_output_below_a_file_is_refused(virest: Virest, tiny: Path) -> None:
 
 @pytest.fixture(scope="session")
 def undisturbed(virest: Virest, _tiny_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What a run of ``tiny`` leaves that straightens it from beginning to end."""
+    """Contents of an uninterrupted run of ``tiny`` without deblurring."""
     folder = tmp_path_factory.mktemp("undisturbed")
     capture = shutil.copytree(_tiny_capture, folder / "tiny")
     options = ("--out", folder / "out", "--jobs", "1", "--deblur", "none")
@@ -381,10 +381,13 @@ def undisturbed(virest: Virest, _tiny_capture: Path, tmp_path_factory: pytest.Te
 
 
 @pytest.mark.parametrize(("code", "after"), [("ENOSPC", 0), ("ENOSPC", 3), ("EDQUOT", 13), ("EROFS", 0)])
-def test_a_disk_that_takes_no_more(
+def test_a_disk_that_rejects_writes(
     virest_here: Virest, tiny: Path, undisturbed: dict[str, Any], code: str, after: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Full, over quota, read-only: exit 8, one line, no half-written file, and --resume goes on afterwards."""
+    """Full, over quota or read-only.
+
+    Exit 8, one line, no half-written file, and ``--resume`` completes the run afterwards.
+    """
     arguments = ["process", str(tiny), "--out", str(tiny.parent / "out"), "--jobs", "1", "--deblur", "none"]
     number, honest, written = getattr(errno, code), outputs._write_bytes, itertools.count(1)
 
@@ -416,10 +419,10 @@ def test_a_disk_that_takes_no_more(
         (["report", "{long}"], 4),
     ],
 )
-def test_names_too_long_for_the_disk_are_no_fault_of_ours(
+def test_a_name_too_long_for_the_disk_is_a_user_error(
     virest: Virest, tiny: Path, arguments: list[str], code: int
 ) -> None:
-    """One line and the code of what was named, not a traceback."""
+    """One line and the exit code of the input concerned, not a traceback."""
     filled = [part.format(tiny=tiny, long=tiny.parent / ("a" * 300)) for part in arguments]
     assert_refused(virest(*filled), code, os.strerror(errno.ENAMETOOLONG))
 
@@ -428,7 +431,7 @@ def test_names_too_long_for_the_disk_are_no_fault_of_ours(
 
 
 def test_a_capture_given_twice_is_refused_before_any_work(virest: Virest, tiny: Path) -> None:
-    """Exit 8, nothing written; different folders of one name are named by their paths (test_finish)."""
+    """Exit 8, and nothing is written. Different folders with one name are told apart by their paths (test_finish)."""
     result = virest("process", tiny, tiny.parent / "tiny/../tiny", cwd=tiny.parent)
     assert_refused(result, 8, "'tiny'")
     assert not (tiny.parent / "virest-out").exists()
@@ -439,8 +442,8 @@ def accounts(out: Path) -> dict[str, dict[str, Any]]:
     return {path.parent.name: json.loads(path.read_text()) for path in out.glob("*/run.json")}
 
 
-def test_a_batch_with_failures_does_the_rest_and_exits_9(virest: Virest, tiny: Path) -> None:
-    """A failure has its line and its run.json, the other capture its row; --resume tries again what failed."""
+def test_a_batch_with_failures_processes_the_rest_and_exits_with_9(virest: Virest, tiny: Path) -> None:
+    """A failed capture has an error line and a run.json, the other capture a row; ``--resume`` retries what failed."""
     arguments = ("process", "./tiny", "none", "odd", *FAST, "--frames", "0:1")
     shutil.copytree(tiny, tiny.parent / "odd")
     (tiny.parent / "odd/gyro_accel.csv").write_bytes(b"")
@@ -466,8 +469,8 @@ def test_a_batch_with_failures_does_the_rest_and_exits_9(virest: Virest, tiny: P
 
 
 @pytest.mark.scenario
-def test_a_batch_says_and_writes_the_same_for_any_number_of_jobs(virest: Virest, tiny: Path) -> None:
-    """Captures are planned by the workers, several at once; lines come in the order of the captures, bytes stay."""
+def test_a_batch_prints_and_writes_the_same_for_any_number_of_jobs(virest: Virest, tiny: Path) -> None:
+    """Workers plan several captures at once; lines keep the order of the captures and files do not change."""
     names = ["tiny", "b", "c", "d"]
     for name in names[1:]:
         shutil.copytree(tiny, tiny.parent / name)
@@ -483,8 +486,8 @@ def test_a_batch_says_and_writes_the_same_for_any_number_of_jobs(virest: Virest,
         assert content(tiny.parent / "out1" / name) == content(tiny.parent / "out2" / name)
 
 
-def test_an_undecodable_frame_fails_alone(virest: Virest, tiny: Path) -> None:
-    """Exit 9; the frames of the damaged group fail with their reason, the rest is done."""
+def test_an_undecodable_frame_fails_only_its_group(virest: Virest, tiny: Path) -> None:
+    """Exit 9; the frames of the damaged group fail with a reason, and the rest is processed."""
     data = bytearray((tiny / "movie.mp4").read_bytes())
     begin = data.index(b"mdat") + 4
     middle = begin + (data.index(b"moov") - begin if data.index(b"moov") > begin else len(data) - begin) // 2
@@ -499,7 +502,7 @@ def test_an_undecodable_frame_fails_alone(virest: Virest, tiny: Path) -> None:
 
 
 def test_no_name_on_standard_input_is_a_warning(virest: Virest) -> None:
-    """`find … | virest process -` that finds nothing has nothing to do."""
+    """If ``find … | virest process -`` finds nothing, there is nothing to process."""
     result = virest("process", "-", stdin="\n")
     assert (result.returncode, result.stdout) == (0, "")
     assert "standard input" in result.stderr
@@ -507,7 +510,10 @@ def test_no_name_on_standard_input_is_a_warning(virest: Virest) -> None:
 
 @pytest.mark.parametrize("as_json", [False, True])
 def test_inspect_prints_what_it_can(virest: Virest, tiny: Path, *, as_json: bool) -> None:
-    """A good capture exits 0; without its movie 4, with what is left on standard output and one line of error."""
+    """An intact capture exits 0.
+
+    Without its movie the exit code is 4, with the remaining facts on standard output and one error line.
+    """
     options = ["--json"] if as_json else []
     good = virest("inspect", tiny, *options)
     assert (good.returncode, good.stderr) == (0, "")
@@ -524,7 +530,7 @@ def test_inspect_prints_what_it_can(virest: Virest, tiny: Path, *, as_json: bool
 # ── being stopped ────────────────────────────────────────────────────────────────────────────────────────────────
 
 ITERATIONS = 40
-"""A tenth of a second for each frame of ``swing``: a run is still at work when it is stopped."""
+"""About 0.1 s per frame of ``swing``, so that a run is still working when it is stopped."""
 
 
 @pytest.fixture(scope="module")
@@ -539,7 +545,7 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> tuple[object, ...]:
 def undisturbed_swing(
     virest: Virest, swing: Path, slow: tuple[object, ...], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Any]:
-    """What an undisturbed run of ``swing`` leaves, by one process."""
+    """Contents of an uninterrupted run of ``swing`` with one process."""
     out = tmp_path_factory.mktemp("undisturbed") / "out"
     assert virest("process", swing, *slow, "--jobs", 1, "--out", out).returncode == 0
     return content(out / "swing")
@@ -547,7 +553,7 @@ def undisturbed_swing(
 
 @pytest.mark.scenario
 @pytest.mark.parametrize(("number", "jobs"), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 2)])
-def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
+def test_ctrl_c_leaves_only_complete_files_and_resume_continues(
     virest: Virest,
     start: Callable[..., Any],
     swing: Path,
@@ -557,7 +563,7 @@ def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
     jobs: int,
     number: signal.Signals,
 ) -> None:
-    """Exit 130 (143 for SIGTERM), one line, no parts, no lock; --resume ends with the files of an undisturbed run."""
+    """Exit 130 (143 for SIGTERM), no partial files, no lock; ``--resume`` yields the files of an uninterrupted run."""
     arguments = ("process", swing, *slow, "--out", tmp_path / "out", "--jobs")
     with start(*arguments, jobs) as process:
         wait_for(lambda: len(below(tmp_path / "out/swing/frames")) > 2, process)
@@ -572,17 +578,17 @@ def test_ctrl_c_leaves_whole_files_only_and_resume_goes_on(
 
 
 @pytest.mark.scenario
-def test_resume_after_a_kill_ends_as_if_nothing_had_happened(
+def test_resume_after_a_kill_gives_the_same_run(
     virest: Virest, start: Callable[..., Any], long_swing: Path, slow: tuple[object, ...], tmp_path: Path
 ) -> None:
-    """SIGKILL at any time; a finished segment is not done again; workers do not outlive their parent."""
+    """After SIGKILL no worker outlives its parent, and finished segments are not processed again."""
     arguments = ("process", long_swing, *slow, "--jobs", 2, "--out")
     alone = ("process", long_swing, *slow, "--jobs", 1, "--out")
     run = tmp_path / "out/swing"
     with start(*arguments, tmp_path / "out") as process:
         wait_for(lambda: any(name.startswith(".segments/") for name in below(run)), process)
         process.kill()
-        process.communicate(timeout=300)  # returns when the last worker has let go of the pipes
+        process.communicate(timeout=300)  # returns when the last worker has closed the pipes
     log = next((run / ".segments").glob("*.jsonl"))
     first = json.loads(log.read_text().splitlines()[0])["output"]
     written_ns = (run / first).stat().st_mtime_ns
@@ -596,10 +602,10 @@ def test_resume_after_a_kill_ends_as_if_nothing_had_happened(
 
 @pytest.mark.scenario
 @pytest.mark.parametrize("preset", ["fast", "best"])
-def test_the_bytes_do_not_depend_on_the_number_of_jobs(
+def test_the_files_do_not_depend_on_the_number_of_jobs(
     virest: Virest, long_swing: Path, tmp_path: Path, preset: str
 ) -> None:
-    """One process and two: the same files."""
+    """One process and two write the same files."""
     for jobs in (1, 2):
         options = ("--preset", preset, "--frames", "0:14", "--jobs", jobs)
         result = virest("process", long_swing, "--out", tmp_path / str(jobs), *options)
@@ -608,8 +614,8 @@ def test_the_bytes_do_not_depend_on_the_number_of_jobs(
 
 
 @pytest.mark.scenario
-def test_a_reader_that_goes_away_ends_the_run_quietly(start: Callable[..., Any], tiny: Path, tmp_path: Path) -> None:
-    """`virest process … --json | head -1`: no traceback, no half-written file."""
+def test_a_closed_reader_ends_the_run_quietly(start: Callable[..., Any], tiny: Path, tmp_path: Path) -> None:
+    """``virest process … --json | head -1`` gives no traceback and no half-written file."""
     with start("process", tiny, "--jobs", 1, "--json", "-q", "--out", tmp_path / "out") as process:
         assert json.loads(process.stdout.readline())["frame"] == 0
         process.stdout.close()

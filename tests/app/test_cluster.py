@@ -1,4 +1,4 @@
-"""The same segments on a Dask cluster: the same bytes, whoever dies meanwhile."""
+"""The same segments on a Dask cluster give the same bytes, even if a worker or the scheduler is killed."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ SIMULATED = "--width 180 --height 240 --frames 40 --exposure-ms 12 --rate 2 --se
 
 
 def wait_until(condition: Callable[[], bool], process: "subprocess.Popen[str]") -> None:
-    """Wait for something while a process runs."""
+    """Wait until a condition holds while a process runs."""
     end = time.monotonic() + 120
     while not condition():
         assert process.poll() is None, process.communicate()
@@ -35,7 +35,7 @@ def wait_until(condition: Callable[[], bool], process: "subprocess.Popen[str]") 
 
 @pytest.fixture(scope="module")
 def turning(virest: Virest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds of a phone that turns, to be restored."""
+    """A simulated capture of 40 frames of a turning phone."""
     folder = tmp_path_factory.mktemp("captures") / "turning"
     done = virest("simulate", folder, "-q", *SIMULATED.split())
     assert done.returncode == 0, done.stderr
@@ -44,7 +44,7 @@ def turning(virest: Virest, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(virest: Virest, turning: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What a local run of one process leaves."""
+    """Contents of a local run with one process."""
     out = tmp_path_factory.mktemp("undisturbed") / "out"
     done = virest("process", turning, "--out", out, *SLOW, "--jobs", 1)
     assert done.returncode == 0, done.stderr
@@ -71,10 +71,10 @@ def finished_segments(run: Path) -> int:
 
 
 @pytest.mark.scenario
-def test_a_killed_worker_costs_its_segments_only(
+def test_a_killed_worker_does_not_change_the_result(
     turning: Path, undisturbed: dict[str, Any], cluster: Cluster, tmp_path: Path
 ) -> None:
-    """One of two is killed in the middle: the other does its segments, and the folder is that of a local run."""
+    """One of two workers is killed: the other processes its segments, and the folder equals that of a local run."""
     with start(turning, tmp_path / "out", cluster.address) as process:
         wait_until(lambda: finished_segments(tmp_path / "out/turning") > 0, process)
         os.kill(cluster.workers[0].pid, signal.SIGKILL)
@@ -85,10 +85,10 @@ def test_a_killed_worker_costs_its_segments_only(
 
 
 @pytest.mark.scenario
-def test_a_lost_scheduler_is_one_line_and_resume_goes_on(
+def test_a_lost_scheduler_gives_one_line_and_resume_continues(
     virest: Virest, turning: Path, undisturbed: dict[str, Any], cluster: Cluster, tmp_path: Path
 ) -> None:
-    """Exit 7; what was done stays; --resume, here on this machine, ends as if nothing had happened."""
+    """Exit 7; finished segments stay; a local ``--resume`` yields the files of an uninterrupted run."""
     run = tmp_path / "out/turning"
     with start(turning, tmp_path / "out", cluster.address) as process:
         wait_until(lambda: finished_segments(run) > 0, process)
@@ -108,8 +108,8 @@ def test_a_lost_scheduler_is_one_line_and_resume_goes_on(
     assert content(run) == undisturbed
 
 
-def test_a_wrong_address_is_one_line(virest: Virest, tmp_path: Path) -> None:
-    """Exit 3, before anything is read, after as long as Dask's own variable says."""
+def test_a_wrong_address_gives_one_line(virest: Virest, tmp_path: Path) -> None:
+    """Exit 3 before any input is read, after the connection timeout of Dask's own variable."""
     address = ("--scheduler", "tcp://127.0.0.1:1")
     result = virest("process", tmp_path, "--out", tmp_path / "out", *address, **{CONNECT_VARIABLE: "1200 ms"})
     assert result.returncode == 3
@@ -119,8 +119,8 @@ def test_a_wrong_address_is_one_line(virest: Virest, tmp_path: Path) -> None:
     assert len(result.stderr.splitlines()) == 1
 
 
-def test_work_that_is_called_off_is_not_written_down_as_failed() -> None:
-    """A lost scheduler cancels what was sent; that is no fault of the frames."""
+def test_a_cancelled_job_is_not_recorded_as_failed() -> None:
+    """A lost scheduler cancels submitted jobs; that is not a fault of the frames."""
     future: Future[dict[str, int]] = Future()
     future.cancel()
     future.set_running_or_notify_cancel()

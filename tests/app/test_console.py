@@ -1,4 +1,4 @@
-"""What a terminal shows while work is under way."""
+"""Terminal output while work is in progress."""
 
 import io
 import sys
@@ -9,22 +9,25 @@ from virest.app import console
 
 
 class Terminal(io.StringIO):
-    """A standard error that a person looks at."""
+    """A standard error that is a terminal."""
 
     def isatty(self) -> bool:
-        """A terminal."""
+        """Always true."""
         return True
 
 
 def looked_at(monkeypatch: pytest.MonkeyPatch) -> Terminal:
-    """A terminal in place of standard error; within the test, since pytest puts its own there before each."""
+    """A terminal in place of standard error.
+
+    Set inside the test because pytest replaces standard error before each test.
+    """
     shown = Terminal()
     monkeypatch.setattr(sys, "stderr", shown)
     return shown
 
 
-def test_work_without_steps_says_what_it_is_and_log_lines_stand_above(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A capture is read and planned for seconds: no bar of 0 of 1, and no silence."""
+def test_work_without_steps_shows_its_name_below_log_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading and planning a capture takes seconds: the terminal shows neither a bar of 0 of 1 nor nothing."""
     terminal = looked_at(monkeypatch)
     with console.progress_bar(None, "trip: reading and planning", quiet=False):
         console.CONSOLE.line("camera profile from camera.yaml")
@@ -34,8 +37,8 @@ def test_work_without_steps_says_what_it_is_and_log_lines_stand_above(monkeypatc
     assert "%" not in terminal.getvalue()
 
 
-def test_what_an_earlier_run_did_is_no_part_of_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight of ten frames were there: the bar begins at 80 %, and its speed is that of the table below it."""
+def test_frames_of_an_earlier_run_do_not_count_towards_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With 8 of 10 frames done, the bar begins at 80 % and shows the speed that the table below it shows."""
     terminal = looked_at(monkeypatch)
     with console.progress_bar(10, "trip", quiet=False, done=8) as bar:
         assert bar is not None
@@ -43,11 +46,11 @@ def test_what_an_earlier_run_did_is_no_part_of_the_speed(monkeypatch: pytest.Mon
         facts = bar.format_dict  # type: ignore[attr-defined]
     assert " 80%" in terminal.getvalue()
     assert (facts["n"], facts["initial"]) == (9, 8)
-    assert facts["rate"] is None  # no moving mean: frames over seconds, as the table counts them
+    assert facts["rate"] is None  # no moving average: frames per second, as in the table
 
 
-def test_no_bar_where_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither with --quiet nor in a file."""
+def test_no_bar_with_quiet_or_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither ``--quiet`` nor a redirected standard error shows a bar."""
     terminal = looked_at(monkeypatch)
     with console.progress_bar(10, "trip", quiet=True) as bar:
         assert bar is None

@@ -1,6 +1,6 @@
-"""A run that is killed at any moment, and continued, ends as if nothing had happened.
+"""A run that is killed at any time and resumed gives the files of an uninterrupted run.
 
-VIREST_KILLS sets how many moments are tried (a handful in the suite).
+VIREST_KILLS sets the number of kills that are tried (the default is 2).
 """
 
 import os
@@ -18,7 +18,7 @@ from run_content import content
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 KILLS = int(os.environ.get("VIREST_KILLS", "2"))
 CHANGES = ("os.rename", "os.remove", "os.rmdir", "os.mkdir", "shutil.rmtree")
-"""Audit events that change a folder, beside files that are opened for writing."""
+"""Audit events that change a folder, apart from opening files for writing."""
 DIES = """
 import os, signal, sys
 place, step, left = sys.argv[1], int(sys.argv[2]), 0
@@ -41,22 +41,25 @@ sys.exit(code)
 
 
 def run_dying(step: int, tiny: Path, out: Path, *options: str) -> "subprocess.CompletedProcess[str]":
-    """Run with one process that kills itself at its ``step``-th change of the output folder; 0 never."""
+    """Run with one process that kills itself at its ``step``-th change of the output folder; 0 means never."""
     arguments = [str(out), str(step), "process", str(tiny), "--out", str(out), "--preset", "fast", "--jobs", "1"]
     command = [sys.executable, "-c", DIES, *arguments, "-q", *options]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.scenario
-def test_killed_before_any_change_of_the_folder_resume_ends_the_same(
+def test_resume_after_a_kill_at_any_folder_change_gives_the_same_run(
     virest: Virest, tiny: Path, tmp_path: Path
 ) -> None:
-    """Steps drawn from all: making folders, opening parts, renaming them, the end's clearing away."""
+    """The steps are sampled from all changes.
+
+    Creating folders, opening partial files, renaming them, and the final cleanup.
+    """
     done = run_dying(0, tiny, tmp_path / "undisturbed")
     assert done.returncode == 0, done.stderr
     steps, expected = int(done.stdout.splitlines()[-1]), content(tmp_path / "undisturbed/tiny")
     assert steps > 24 * 2
-    last = steps - 2  # the run is finished, its scaffolding still stands
+    last = steps - 2  # the run is finished, but its temporary files still exist
     for step in {last, *random.Random(42).sample(range(1, steps + 1), min(KILLS, steps))}:
         out = tmp_path / f"killed-{step}"
         assert run_dying(step, tiny, out).returncode == -signal.SIGKILL
@@ -67,8 +70,8 @@ def test_killed_before_any_change_of_the_folder_resume_ends_the_same(
 
 
 @pytest.mark.scenario
-def test_killed_at_random_times_with_workers_resume_ends_the_same(virest: Virest, tiny: Path, tmp_path: Path) -> None:
-    """The parent dies and its workers with it, or one worker alone: then nothing has to be continued."""
+def test_resume_after_a_kill_at_a_random_time_gives_the_same_run(virest: Virest, tiny: Path, tmp_path: Path) -> None:
+    """The parent process is killed at a random time while two workers run."""
     options = ("--preset", "fast", "--jobs", "2", "-q")
     began = time.monotonic()
     assert virest("process", tiny, "--out", tmp_path / "undisturbed", *options).returncode == 0
@@ -80,7 +83,7 @@ def test_killed_at_random_times_with_workers_resume_ends_the_same(virest: Virest
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
             time.sleep(rng.uniform(0.3, 1.0) * whole_s)
             process.kill()
-            process.communicate(timeout=60)  # returns when the last worker has let go of the pipe
+            process.communicate(timeout=60)  # returns when the last worker has closed the pipe
         ended = (out / "tiny/run.json").exists() and not (out / "tiny/.run").exists()
         again = virest("process", tiny, "--out", out, *options, "--resume")
         assert again.returncode == 0, (number, ended, again.stderr)

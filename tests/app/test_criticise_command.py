@@ -1,4 +1,4 @@
-"""``virest criticise``: residuals of any calibration, in files as others write them."""
+"""``virest criticise``: residuals of any calibration, in files written by other programs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Table = dict[str, np.ndarray[Any, Any]]
 
 
 def residuals(seed: int, **sizes: float) -> Table:
-    """40 frames of 60 points with noise of 0.15 px and one in fifty lost; sizes: what is hidden."""
+    """40 frames of 60 points with noise of 0.15 px and 2 % outliers; ``sizes`` sets the hidden effects."""
     rng, count = np.random.default_rng(seed), 40 * 60
     x, y = rng.uniform(0, 640, count), rng.uniform(0, 480, count)
     frame = np.repeat(np.arange(40.0), 60)
@@ -45,10 +45,10 @@ def written(tmp_path: Path) -> Callable[[Table], Path]:
     return write
 
 
-def test_what_is_hidden_in_residuals_is_described(
+def test_hidden_effects_in_residuals_are_described(
     written: Callable[[Table], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A lens off centre and uneven rows: covariates, shapes and sizes, as JSON."""
+    """The JSON names covariates, shapes and sizes of a decentred lens and of uneven row times."""
     path = written(residuals(1, lens=0.3, late_s=2e-3))
     assert cli.run(["criticise", str(path), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -64,18 +64,18 @@ def test_what_is_hidden_in_residuals_is_described(
         assert field["p_value"] < found["false_alarm_rate"]
 
 
-def test_the_text_says_it_in_a_sentence(
+def test_the_text_describes_the_effect_in_a_sentence(
     written: Callable[[Table], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:  # fmt: skip
-    """With what may be behind it and what would tell."""
+    """It adds a possible cause."""
     assert cli.run(["criticise", str(written(residuals(2, lens=0.3)))]) == 0
     said = capsys.readouterr().out
     assert "a lens that is not centred (tangential distortion)" in said
     assert "likely: a lens element off centre" in said
 
 
-def test_what_two_covariates_do_together_is_described_after_what_each_does() -> None:
-    """Distortion that follows the focus, beside a focal length that does: the pair comes last."""
+def test_an_interaction_is_described_after_the_single_covariates() -> None:
+    """Distortion and focal length both depend on the focus: the pair of radius and focus comes last."""
     table = residuals(3)
     u, v = (table["x"] - 320) / 320, (table["y"] - 240) / 320
     focus = np.random.default_rng(4).uniform(0, 2, 40)[table["frame"].astype(int)]
@@ -88,15 +88,15 @@ def test_what_two_covariates_do_together_is_described_after_what_each_does() -> 
     assert not criticise({**table, "focus": focus}).findings
 
 
-def test_a_lens_drawn_at_random_is_nothing() -> None:
-    """Eight tables of noise, none of which is described: at most 1e-3 each may be by chance."""
+def test_pure_noise_gives_no_finding() -> None:
+    """None of eight tables of noise has a finding; the false-alarm rate is at most 1e-3 each."""
     assert not any(criticise(residuals(seed)).findings for seed in range(10, 18))
 
 
-def test_a_missing_column_is_named_with_what_may_be_meant(
+def test_a_missing_column_is_named_with_a_suggestion(
     written: Callable[[Table], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Exit code 4, one line."""
+    """Exit code 4, and the error suggests a column to rename."""
     table = residuals(3)
     table["dx_px"] = table.pop("dx")
     assert cli.run(["criticise", str(written(table))]) == 4
@@ -116,7 +116,7 @@ FORMS = {
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_table_reads_the_same_in_every_form(tmp_path: Path, form: str) -> None:
-    """Semicolons, tabs, blanks behind a vnlog legend: the same columns and values."""
+    """Semicolons, decimal commas, tabs, a vnlog legend or a byte order mark give the same columns and values."""
     text = "x,y,dx,dy,temp\n1.5,2.0,-0.25,0.5,30.0\n3.5,4.0,0.75,-1e-2,31.5\n"
     path = tmp_path / "residuals.csv"
     path.write_text(FORMS[form](text), encoding="utf-8")
@@ -129,10 +129,10 @@ def test_a_table_reads_the_same_in_every_form(tmp_path: Path, form: str) -> None
 @pytest.mark.parametrize(
     ("column", "value", "said"), [("dx", 1e300, "1e+300 px in column dx"), ("dx", 0.0, "all residuals are 0")]
 )
-def test_values_that_are_no_residuals_are_refused(
+def test_impossible_residuals_are_rejected(
     written: Callable[[Table], Path], capsys: pytest.CaptureFixture[str], column: str, value: float, said: str
 ) -> None:
-    """Overflowing ones, and nothing but noughts."""
+    """Overflowing values and columns of zeros are errors."""
     table = residuals(4)
     table[column] = np.full_like(table[column], value)
     table["dy"] = np.zeros_like(table["dy"])
@@ -141,7 +141,7 @@ def test_values_that_are_no_residuals_are_refused(
 
 
 def test_points_on_one_line_have_no_map() -> None:
-    """A constant x is asked along nothing, and is no error."""
+    """A constant x is not used as a covariate and is no error."""
     table = residuals(5)
     table["x"] = np.full_like(table["x"], 100.0)
     assert "displacement over x, y" not in criticise(table).forms
@@ -150,10 +150,10 @@ def test_points_on_one_line_have_no_map() -> None:
 @pytest.mark.parametrize(
     "content", ["", "x,y,dx,dy\n1,2,3,4\n", "x,y,dx,dy\na,b,c,d\n", "x,x,dx,dy\n1,1,1,1\n", "1,2,3,4\n5,6,7,8\n"]
 )
-def test_a_file_that_is_no_table_ends_in_one_line(
+def test_a_file_that_is_not_a_table_gives_one_line(
     tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Empty, one row, words, a column twice, no names."""
+    """An empty file, one row, words, a repeated column, or no column names."""
     path = tmp_path / "residuals.csv"
     path.write_text(content, encoding="utf-8")
     assert cli.run(["criticise", str(path)]) == 4

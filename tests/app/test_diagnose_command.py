@@ -1,4 +1,4 @@
-"""``virest diagnose``: its files, its table, its exit codes, over diagnoses that are given."""
+"""``virest diagnose``: its files, its table and its exit codes, for given diagnoses."""
 
 import dataclasses
 import json
@@ -42,7 +42,7 @@ def offset_cause() -> Finding:
 
 
 def odd_cause() -> Finding:
-    """A cause with a list, a word, an infinity and no deviation."""
+    """A cause with a list, a word, an infinite value and no standard deviation."""
     changes = {
         "gyro_bias_rad_s": ParameterChange([0.0, 0.0, 0.0], [0.01, -0.02, 0.03], [0.001, 0.002, float("nan")]),
         "depth_m": ParameterChange(None, float("inf"), None),
@@ -71,7 +71,7 @@ def diagnosis(source: diagnose.Source, verdict: str, causes: tuple[Finding, ...]
 
 @pytest.fixture
 def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Let the ladder come to a given verdict."""
+    """Make the ladder return a given verdict."""
 
     def give(verdict: str = "explained", *causes: Finding, error: Exception | None = None) -> None:
         def climb(source: diagnose.Source, progress: Say, _each: ParallelMap, _kept_back: object = ()) -> Diagnosis:
@@ -89,7 +89,7 @@ def ladder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 @pytest.fixture(autouse=True)
 def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Blank files for figures: drawing takes most of the time, and what is left is too little for processes."""
+    """Replace figures by blank files, since drawing takes most of the time, and use one process."""
 
     def blank(_capture: object, found: Diagnosis, _each: ParallelMap) -> tuple[dict[str, bytes], list[list[str]]]:
         names = [f"figures/{number:02d}_{cause.name}.png" for number, cause in enumerate(found.causes, start=1)]
@@ -109,8 +109,8 @@ def files_in(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
-def test_the_account_has_the_agreed_keys_and_no_others(tiny: Path, tmp_path: Path, ladder, monkeypatch) -> None:
-    """diagnosis.json: keys, gain, null for what is not a number, "inf" for infinity; figures that exist."""
+def test_diagnosis_json_has_exactly_the_documented_keys(tiny: Path, tmp_path: Path, ladder, monkeypatch) -> None:
+    """diagnosis.json has the gain, null for NaN, "inf" for infinity, and names of figures that exist."""
     monkeypatch.setattr(diagnose, "draw_figures", DRAW_FIGURES)
     ladder("explained", offset_cause(), odd_cause())
     assert run(tiny, "--out", tmp_path / "out") == 0
@@ -139,7 +139,7 @@ def test_the_account_has_the_agreed_keys_and_no_others(tiny: Path, tmp_path: Pat
 
 
 def test_the_extended_profile_can_be_used(tiny: Path, tmp_path: Path, ladder) -> None:
-    """extended.yaml reads as a profile with the causes in it, and says how well they are known."""
+    """extended.yaml reads as a profile that includes the causes and their standard deviations."""
     ladder("explained", offset_cause(), odd_cause())
     assert run(tiny, "--out", tmp_path / "out") == 0
     path = tmp_path / "out/tiny/extended.yaml"
@@ -151,7 +151,10 @@ def test_the_extended_profile_can_be_used(tiny: Path, tmp_path: Path, ladder) ->
 
 
 def test_the_table_reads_from_cause_to_verdict(tiny: Path, tmp_path: Path, ladder, capfd) -> None:
-    """Cause, value ± deviation, before and after, gain; the sentence, rivals; what remains; the verdict last."""
+    """Cause, value ± deviation, before and after, gain; then the sentence, rivals, the remaining residual.
+
+    The verdict last.
+    """
     ladder("unexplained", offset_cause(), odd_cause())
     assert run(tiny, "--out", tmp_path / "out") == 0
     lines = capfd.readouterr().out.splitlines()
@@ -167,7 +170,7 @@ def test_the_table_reads_from_cause_to_verdict(tiny: Path, tmp_path: Path, ladde
     assert lines[-1] == "verdict: unexplained"
 
 
-def test_json_is_one_line_with_the_account(tiny: Path, tmp_path: Path, ladder, capfd) -> None:
+def test_json_is_one_line_with_the_content_of_diagnosis_json(tiny: Path, tmp_path: Path, ladder, capfd) -> None:
     """Standard output holds the content of diagnosis.json and nothing else."""
     ladder("explained", offset_cause())
     assert run(tiny, "--out", tmp_path / "out", "--json") == 0
@@ -178,7 +181,7 @@ def test_json_is_one_line_with_the_account(tiny: Path, tmp_path: Path, ladder, c
 
 @pytest.mark.parametrize(("verdict", "code"), [("consistent", 0), ("explained", 10), ("unexplained", 10)])
 def test_check_fails_unless_consistent(tiny: Path, tmp_path: Path, ladder, verdict: str, code: int) -> None:
-    """--check: 10 for anything but consistent; the files are written all the same."""
+    """``--check`` exits with 10 for any verdict but consistent; the files are written in each case."""
     ladder(verdict, *([offset_cause()] if verdict == "explained" else []))
     assert run(tiny, "--out", tmp_path / "out", "--check") == code
     facts = json.loads((tmp_path / "out/tiny/diagnosis.json").read_text())
@@ -186,8 +189,8 @@ def test_check_fails_unless_consistent(tiny: Path, tmp_path: Path, ladder, verdi
     assert len(facts["causes"]) == (verdict == "explained")
 
 
-def test_a_diagnosis_is_not_replaced_unasked(tiny: Path, tmp_path: Path, ladder) -> None:
-    """Exit 8 before any work; --overwrite replaces it, and figures of causes that are gone go too."""
+def test_a_diagnosis_is_replaced_only_on_request(tiny: Path, tmp_path: Path, ladder) -> None:
+    """Exit 8 before any work. ``--overwrite`` replaces it and removes figures of causes that are gone."""
     ladder("explained", offset_cause())
     out = tmp_path / "out"
     assert run(tiny, "--out", out) == 0
@@ -203,8 +206,8 @@ def test_a_diagnosis_is_not_replaced_unasked(tiny: Path, tmp_path: Path, ladder)
     assert "figures/mine.png" in files_in(out / "tiny")
 
 
-def test_a_run_of_the_same_name_is_no_obstacle(tiny: Path, tmp_path: Path, ladder) -> None:
-    """The diagnosis goes beside the pictures of `process`, which stay."""
+def test_a_diagnosis_keeps_the_run_of_the_same_name(tiny: Path, tmp_path: Path, ladder) -> None:
+    """The diagnosis is written beside the frames of ``process``, which stay."""
     out = tmp_path / "out"
     assert cli.run(["process", str(tiny), "--out", str(out), "--frames", "2:4", "--jobs", "1", "-q"]) == 0
     before = {name: (out / "tiny" / name).read_bytes() for name in files_in(out / "tiny")}
@@ -214,7 +217,7 @@ def test_a_run_of_the_same_name_is_no_obstacle(tiny: Path, tmp_path: Path, ladde
     assert "diagnosis.json" in files_in(out / "tiny")
 
 
-def test_nothing_half_written_stays(tiny: Path, tmp_path: Path, ladder, monkeypatch) -> None:
+def test_a_full_disk_leaves_no_partial_output(tiny: Path, tmp_path: Path, ladder, monkeypatch) -> None:
     """A disk that fills up at the last file leaves neither figures nor folders; exit 8."""
     ladder("explained", offset_cause())
     write = diagnose.write_whole
@@ -234,8 +237,8 @@ def test_nothing_half_written_stays(tiny: Path, tmp_path: Path, ladder, monkeypa
 @pytest.mark.parametrize(
     ("error", "code"), [(CalibrationError("too little motion"), 6), (OutputError("locked"), 8), (ValueError("ours"), 1)]
 )
-def test_a_ladder_that_fails_gives_its_own_code(tiny: Path, tmp_path: Path, ladder, error, code: int, capfd) -> None:
-    """One line for a known error, and no file."""
+def test_a_failing_ladder_gives_its_own_exit_code(tiny: Path, tmp_path: Path, ladder, error, code: int, capfd) -> None:
+    """The error goes to standard error, and no file is written."""
     ladder(error=error)
     assert run(tiny, "--out", tmp_path / "out") == code
     captured = capfd.readouterr()
@@ -244,7 +247,7 @@ def test_a_ladder_that_fails_gives_its_own_code(tiny: Path, tmp_path: Path, ladd
     assert not (tmp_path / "out").exists()
 
 
-def test_what_cannot_be_read_is_said(tiny: Path, tmp_path: Path, ladder) -> None:
+def test_unusable_inputs_have_their_exit_codes(tiny: Path, tmp_path: Path, ladder) -> None:
     """No such capture: 4; a profile of another size: 3; an output that is a file: 8; no argument: 2."""
     ladder("consistent")
     assert run(tmp_path / "nowhere", "--out", tmp_path / "out") == 4
@@ -259,8 +262,11 @@ def test_what_cannot_be_read_is_said(tiny: Path, tmp_path: Path, ladder) -> None
 
 
 @pytest.mark.scenario
-def test_a_readout_that_is_half_as_long_is_found(tmp_path: Path, monkeypatch) -> None:
-    """From a capture to the right cause by two processes, its size within its deviation, and neighbours that agree."""
+def test_a_halved_readout_time_is_found(tmp_path: Path, monkeypatch) -> None:
+    """Two processes find the right cause and its value within four deviations; neighbouring frames then agree better.
+
+    One process finds the same.
+    """
     blank = diagnose.draw_figures
     monkeypatch.setattr(diagnose, "draw_figures", DRAW_FIGURES)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
@@ -284,4 +290,4 @@ def test_a_readout_that_is_half_as_long_is_found(tmp_path: Path, monkeypatch) ->
     alone = json.loads((tmp_path / "alone/trip/diagnosis.json").read_text())
     for cause in [*facts["causes"], *alone["causes"]]:
         del cause["figures"]
-    assert facts == alone, "one process tells what two tell"
+    assert facts == alone, "one process gives the same diagnosis as two"

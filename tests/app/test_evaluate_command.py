@@ -1,4 +1,4 @@
-"""``virest evaluate shutter`` and ``deblur``: tables that agree with themselves, ours ahead, wrong calls refused."""
+"""``virest evaluate shutter`` and ``deblur``: consistent tables, virest ahead of the baselines, and usage errors."""
 
 import json
 import shutil
@@ -22,7 +22,7 @@ Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 
 @pytest.fixture(scope="module")
 def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fast pan over a marked chessboard that reaches beyond the picture, as ``simulate --scene board`` makes it."""
+    """A fast pan over a marked chessboard larger than the frame, as ``simulate --scene board`` makes it."""
     folder = tmp_path_factory.mktemp("captures") / "wall"
     wishes: dict[str, Any] = {"rate_rad_s": 2.0, "exposure_ms": 1.0, "bitrate_bits_per_px": 2.0, "seed": 77}
     simulate_command(folder, scene="board", width=400, height=304, frames=5, focal_px=380.0, **wishes)
@@ -40,14 +40,14 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def judged_shutter(board: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], str, Path]:
-    """The board's evaluation, once for all tests."""
+    """The board's evaluation, shared by all tests."""
     maps = tmp_path_factory.mktemp("maps")
     facts, text = run_shutter(ShutterOptions((str(board),), out=maps))
     return facts, text, maps
 
 
-def test_straightening_row_by_row_is_ahead_in_angles_and_pictures(judged_shutter) -> None:
-    """A tenth or less of what any other method leaves at the outer corners, and ahead in MSE, PSNR and SSIM."""
+def test_row_by_row_straightening_is_ahead_in_angles_and_pictures(judged_shutter) -> None:
+    """It leaves less than a fifth of any other method's angle error at the outer corners, and leads in MSE and SSIM."""
     methods = judged_shutter[0]["all"]["methods"]
     ours = methods["rowwise"]
     assert ours["outer"]["mean_abs_deg"] < 0.05
@@ -59,7 +59,7 @@ def test_straightening_row_by_row_is_ahead_in_angles_and_pictures(judged_shutter
 
 
 def test_every_figure_comes_with_its_count_and_mse_agrees_with_psnr(judged_shutter) -> None:
-    """Means, spreads and counts of all methods over the same angles; PSNR is that of the MSE beside it."""
+    """All methods are averaged over the same angles; each PSNR follows from the MSE beside it."""
     facts, text, maps = judged_shutter
     whole = facts["all"]
     assert set(whole["methods"]) == set(METHODS)
@@ -78,8 +78,8 @@ def test_every_figure_comes_with_its_count_and_mse_agrees_with_psnr(judged_shutt
     assert sheet[30:, width : 2 * width].mean() > 3 * sheet[30:, -width:].mean()
 
 
-def test_frames_with_neighbours_are_judged_beside_merged_ones(tmp_path: Path) -> None:
-    """Neighbours in the movie are used although one frame is judged; joint is ahead of single and of merging."""
+def test_joint_restoration_is_ahead_of_single_frames_and_merging(tmp_path: Path) -> None:
+    """Neighbouring frames of the movie are used even if only one frame is evaluated."""
     folder = tmp_path / "over_time"
     wishes: dict[str, Any] = {"rate_rad_s": 1.8, "exposure_ms": 16.0, "bitrate_bits_per_px": 1.0, "seed": 80}
     simulate_command(folder, scene="leaves", width=320, height=240, frames=7, **wishes)
@@ -94,8 +94,8 @@ def test_frames_with_neighbours_are_judged_beside_merged_ones(tmp_path: Path) ->
     assert "over time" in text
 
 
-def test_deblurring_is_ahead_of_the_baselines_in_all_three(shaken: Path, tmp_path: Path) -> None:
-    """PSNR, SSIM and matches at once where the blur differs over the picture; the table's PSNR is that of its MSE."""
+def test_deblurring_is_ahead_of_the_baselines_in_all_measures(shaken: Path, tmp_path: Path) -> None:
+    """It leads in PSNR, SSIM and matches where the blur varies over the frame; each PSNR follows from its MSE."""
     facts, text = run_deblur(DeblurOptions((str(shaken),), frames=slice(0, 1), out=tmp_path))
     assert facts["first"]["virest best"] == {"part": 1.0, "led_by": {}}
     for found in facts["methods"].values():
@@ -108,7 +108,7 @@ def test_deblurring_is_ahead_of_the_baselines_in_all_three(shaken: Path, tmp_pat
 def test_a_missing_scikit_image_is_left_out_with_a_note(
     shaken: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Its rows are missing, and the text says why."""
+    """Its rows are missing, and the text states why."""
     import virest.evaluation.baselines as baselines
 
     monkeypatch.setattr(baselines, "find_spec", lambda name: None)
@@ -120,8 +120,8 @@ def test_a_missing_scikit_image_is_left_out_with_a_note(
     assert "skimage wiener: skipped" in text
 
 
-def test_two_folders_are_laid_over_each_other(shaken: Path, tmp_path: Path, virest: Virest) -> None:
-    """A picture moved by whole and broken pixels is brought back before it is compared, and its shift is told."""
+def test_shifted_pictures_are_aligned_before_comparison(shaken: Path, tmp_path: Path, virest: Virest) -> None:
+    """A picture shifted by a fraction of a pixel is aligned before the comparison, and its shift is reported."""
     truth = shaken / "truth" / "frames"
     moved = tmp_path / "moved"
     moved.mkdir()
@@ -142,8 +142,8 @@ def test_two_folders_are_laid_over_each_other(shaken: Path, tmp_path: Path, vire
     assert facts["methods"]["restored"]["psnr_db"] > 30
 
 
-def test_a_picture_in_its_place_is_not_moved(shaken: Path) -> None:
-    """The truth against itself: no error at all, told as infinite."""
+def test_an_aligned_picture_is_not_moved(shaken: Path) -> None:
+    """The truth compared with itself has no error; its PSNR is reported as infinite."""
     truth = shaken / "truth" / "frames"
     facts, text = run_deblur(DeblurOptions(restored=truth, reference=truth))
     assert facts["methods"]["restored"]["mse"] == 0
@@ -152,7 +152,7 @@ def test_a_picture_in_its_place_is_not_moved(shaken: Path) -> None:
 
 
 def test_captures_without_truth_or_board_are_refused(shaken: Path, tmp_path: Path) -> None:
-    """The error says what is missing; its exit code is the captures' one."""
+    """The CaptureError names what is missing."""
     with pytest.raises(CaptureError, match="methods find the board"):
         run_shutter(ShutterOptions((str(shaken),)))
     bare = tmp_path / "bare"
@@ -172,11 +172,11 @@ def test_captures_without_truth_or_board_are_refused(shaken: Path, tmp_path: Pat
         (("shutter", "nowhere"), 4, "nowhere"),
     ],
 )
-def test_wrong_calls_are_refused_in_one_line(
+def test_usage_errors_have_their_exit_codes(
     arguments: tuple[str, ...], code: int, says: str, capsys: pytest.CaptureFixture[str], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """Usage errors are 2, folders that cannot be used 4."""
+    """Usage errors exit with 2, unusable folders with 4."""
     from virest.app.cli import run
 
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Case C: sequences of a capture, a SLAM as a command, and structure from motion on a small walk."""
+"""``evaluate slam``: sequences of a capture, a SLAM program as a command, and structure from motion."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def judged(capture: Path, tmp_path_factory: pytest.TempPathFactory):
-    """A run with a program that knows the truth and spoils it by kind and seed: folder, facts, text, code."""
+    """A run with a program that knows the true path and distorts it by kind and seed: folder, facts, text, code."""
     folder = tmp_path_factory.mktemp("judged")
     script, out = folder / "pre tender.py", folder / "out put"
     script.write_text(PRETENDER)
@@ -57,7 +57,10 @@ def judged(capture: Path, tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_a_program_is_scored_by_kind_with_median_and_range(judged):
-    """Zigzags of 20 and 2 mm come back as such, whatever scale and clock; nine tenths of what was added are gone."""
+    """Zigzags of 20 mm and 2 mm are measured as such for any scale and clock.
+
+    Restoration removes 90 % of the added error.
+    """
     _, facts, text, code = judged
     (row,) = facts["results"]
     assert code == 0
@@ -72,7 +75,7 @@ def test_a_program_is_scored_by_kind_with_median_and_range(judged):
 
 
 def test_the_three_sequences_hold_the_same_frames(judged, capture: Path):
-    """EuRoC's layout with the capture's stamps; the pictures differ, and the truth is the simulator's."""
+    """They use EuRoC's layout with the capture's timestamps; the pictures differ, and the truth is the simulator's."""
     out, facts, _, _ = judged
     stamps = [int(line.split(",")[0]) for line in (capture / "frame_timestamps.txt").read_text().splitlines()[1:]]
     folders = {kind: out / "sequences" / "tiny" / kind for kind in ("global", "rolling", "restored")}
@@ -90,13 +93,13 @@ def test_the_three_sequences_hold_the_same_frames(judged, capture: Path):
 
 
 def test_an_existing_folder_is_not_written_into(judged, capture: Path):
-    """What stands there stays."""
+    """A folder that is not empty is an error."""
     with pytest.raises(OutputError, match="not empty"):
         run_slam([capture], SlamOptions(command="x {sequence} {trajectory}", out=judged[0]))
 
 
-def test_a_capture_without_truth_is_one_line(capture: Path, tmp_path: Path):
-    """Nothing can be scored without the true path."""
+def test_a_capture_without_truth_is_an_error(capture: Path, tmp_path: Path):
+    """Nothing can be scored without the true path: exit 4."""
     with pytest.raises(CaptureError, match="no such file"):
         write_sequences(tmp_path, tmp_path / "out", PRESETS["fast"])
     facts, text, code = run_slam([tmp_path], SlamOptions(command="true {sequence} {trajectory}"))
@@ -114,13 +117,13 @@ def test_a_capture_without_truth_is_one_line(capture: Path, tmp_path: Path):
     ],
 )
 def test_a_command_with_wrong_placeholders_is_refused(text: str, said: str):
-    """Before any work, with the names that are known."""
+    """The error names the missing or unknown placeholder."""
     with pytest.raises(SettingsError, match=said):
         split_command(text)
 
 
-def test_a_value_stays_one_argument_and_no_shell_sees_it(tmp_path: Path):
-    """Blanks, quotes, semicolons and dollars in a path are nothing but letters."""
+def test_a_value_stays_one_argument_and_reaches_no_shell(tmp_path: Path):
+    """Spaces, quotes, semicolons and dollar signs in a path are passed on unchanged."""
     nasty = f"a b'; touch {tmp_path}/made; $(touch {tmp_path}/made) {{seed}}"
     words = fill_command(split_command("prog -s{sequence} {trajectory}"), {"sequence": nasty, "trajectory": "t"})
     assert words == ["prog", f"-s{nasty}", "t"]
@@ -131,8 +134,8 @@ def test_a_value_stays_one_argument_and_no_shell_sees_it(tmp_path: Path):
     assert not (tmp_path / "made").exists()
 
 
-def test_a_program_that_hangs_is_stopped_and_one_that_is_missing_named(tmp_path: Path):
-    """A time limit is a failed run; a program that is not there is an error of the call."""
+def test_a_hanging_program_is_stopped_and_a_missing_one_is_named(tmp_path: Path):
+    """A run that exceeds the time limit fails; a program that does not exist is a settings error."""
     assert not run_command([sys.executable, "-c", "import time; time.sleep(60)"], tmp_path / "log", 0.3)
     assert "stopped after 0.3 s" in (tmp_path / "log").read_text()
     with pytest.raises(SettingsError, match="no-such-slam"):
@@ -140,15 +143,15 @@ def test_a_program_that_hangs_is_stopped_and_one_that_is_missing_named(tmp_path:
 
 
 def test_settings_for_orb_slam_hold_the_lens(judged):
-    """Both generations' keys, the lens as in the profile."""
+    """The file has the keys of both ORB-SLAM generations, with the lens of the profile."""
     text = (judged[0] / "sequences" / "tiny" / "orb_slam.yaml").read_text()
     assert text.startswith("%YAML:1.0")
     for line in ("Camera.fx: 150.0", "Camera1.cy: 79.5", "Camera.width: 192", "Camera.fps: 15"):
         assert line in text.splitlines()
 
 
-def test_a_wrong_call_ends_with_its_exit_code(virest, tmp_path: Path):
-    """2 for options that do not go together, 3 for a command without its places, 4 for a folder that is not there."""
+def test_errors_have_their_exit_codes(virest, tmp_path: Path):
+    """2 for options that exclude each other, 3 for a command without its placeholders, 4 for a missing folder."""
     assert virest("evaluate", "slam", tmp_path, "--devices").returncode == 2
     refused = virest("evaluate", "slam", tmp_path, "--command", "slam {sequence}")
     assert (refused.returncode, refused.stdout) == (3, "")
@@ -159,8 +162,8 @@ def test_a_wrong_call_ends_with_its_exit_code(virest, tmp_path: Path):
     assert json.loads(missing.stdout)["summary"]["failed"] == 1
 
 
-def test_standard_captures_have_names_and_seeds_of_their_own():
-    """No two share a folder or a motion; every one has a readout that a frame can hold."""
+def test_standard_captures_have_unique_names_and_seeds():
+    """No two share a folder or a motion; every readout time is shorter than the frame period."""
     plans = [*SEQUENCES, *DEVICES]
     assert len({plan.name for plan in plans}) == len({plan.seed for plan in plans}) == len(plans)
     assert all(plan.readout_ms < 1000 / plan.fps for plan in plans)
@@ -168,7 +171,7 @@ def test_standard_captures_have_names_and_seeds_of_their_own():
 
 @pytest.mark.scenario
 def test_structure_from_motion_profits_from_restored_frames(tmp_path: Path):
-    """Nine tenths of the error that the rolling shutter adds are gone, on a short walk before a tilted wall."""
+    """Restoration removes 90 % of the error that the rolling shutter adds on a short walk before a tilted wall."""
     pytest.importorskip("pycolmap", reason="the extra [slam] is not installed")
     wall = dataclasses.replace(SEQUENCES[0], name="walk", near_m=None, seed=77, fps=12.0, rate_rad_s=1.1)
     plan = smaller(wall, 12)

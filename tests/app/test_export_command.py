@@ -1,4 +1,4 @@
-"""`virest export`: what SLAM tools find, that it reads back the same, and what is refused."""
+"""``virest export``: files for SLAM tools, reading an export back, and exports that are refused."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FRAMES = 14
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory) -> Path:
-    """A simulated capture whose profile is the true one, clock offset and all."""
+    """A simulated capture whose profile is the true one, including the clock offset."""
     folder = tmp_path_factory.mktemp("captures") / "walk"
     effects = (f"time_offset={OFFSET_S}", "clock_skew=0.0002")
     simulate_command(
@@ -41,7 +41,7 @@ def walk(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def restored(walk, tmp_path_factory) -> Path:
-    """A finished run, of which one frame was skipped."""
+    """A finished run with one skipped frame."""
     out = tmp_path_factory.mktemp("runs")
     assert process_captures([str(walk)], ProcessOptions(out, RestorationSettings(deblur="none"))) == 0
     run = out / "walk"
@@ -53,20 +53,23 @@ def restored(walk, tmp_path_factory) -> Path:
 
 
 def export(capture: Path, out: Path, **options: object) -> tuple[Path, dict]:
-    """Export, and where it went."""
+    """Export a capture; return the folder and the facts."""
     facts, _ = run_export(plan_export(str(capture), ExportOptions(out, **options)))  # type: ignore[arg-type]
     return out / capture.name, facts
 
 
 def frames_of(folder: Path) -> dict[int, np.ndarray]:
-    """Every picture of a capture, RGB."""
+    """Every frame of a capture, RGB."""
     capture = read_capture(folder, look_at_pictures=False)
     return dict(read_frames(capture.movie, probe_movie(capture.movie), 0, 999))
 
 
 @pytest.mark.parametrize("form", ["euroc", "tum"])
 def test_an_export_reads_back_the_same(walk, tmp_path, form):
-    """Pixels, stamps, samples and profile come back; the samples on the camera's clock, so offset and skew are gone."""
+    """Pixels, timestamps, samples and profile are the same.
+
+    Samples use the camera's clock, so offset and skew are zero.
+    """
     folder, facts = export(walk, tmp_path, format=form)
     before, after = read_capture(walk), read_capture(folder)
     assert facts["frames"] == len(after.frames) == len(before.usable)
@@ -90,7 +93,7 @@ def test_an_export_reads_back_the_same(walk, tmp_path, form):
 
 
 def test_every_tool_finds_its_files(walk, tmp_path):
-    """Lists, sensor files, camera chain, noise and settings parse, agree, and name pictures that are there."""
+    """Lists, sensor files, camera chain, noise and settings parse, agree, and name existing pictures."""
     folder, facts = export(walk, tmp_path)
     profile, _ = resolve_profile(read_capture(walk))
     assert profile.intrinsics is not None
@@ -114,8 +117,8 @@ def test_every_tool_finds_its_files(walk, tmp_path):
     assert json.loads((folder / "export.json").read_text())["frames"] == facts["frames"]
 
 
-def test_stamps_at_the_instant_of_the_picture(walk, tmp_path):
-    """Each stamp is moved to the middle of its own exposure and readout; the profile says where rows begin."""
+def test_stamps_at_the_middle_of_exposure_and_readout(walk, tmp_path):
+    """Each timestamp moves to the middle of its own exposure and readout; the profile states where rows begin."""
     folder, facts = export(walk, tmp_path, stamps="instant")
     assert facts["instant_after_stamp_s"] == 0.0
     before, after = read_capture(walk), read_capture(folder)
@@ -128,8 +131,8 @@ def test_stamps_at_the_instant_of_the_picture(walk, tmp_path):
     assert chain["cam0"]["timeshift_cam_imu"] == 0.0
 
 
-def test_restored_pictures(walk, restored, tmp_path):
-    """Pictures of a run are copied, those that it skipped are left out, and they have neither rows nor exposure."""
+def test_an_export_of_restored_frames(walk, restored, tmp_path):
+    """Frames of a run are copied, skipped ones are left out, and exported frames have neither readout nor exposure."""
     folder, facts = export(walk, tmp_path, restored=restored)
     assert facts["left_out"] == {"skipped": 1}
     after = read_capture(folder)
@@ -140,11 +143,11 @@ def test_restored_pictures(walk, restored, tmp_path):
     assert all(frame.exposure_s is None for frame in after.frames)
     profile, _ = resolve_profile(after)
     assert (profile.readout_known, profile.shutter.readout_time_s, profile.time_offset_s) == (True, 0.0, 0.0)
-    assert facts["instant_after_stamp_s"] == 0.0  # the first row's exposure start, which the stamps mean
+    assert facts["instant_after_stamp_s"] == 0.0  # the start of the first row's exposure, to which the timestamps refer
 
 
-def test_restored_pictures_have_no_readout_in_any_format(walk, restored, tmp_path):
-    """Straightened frames show one instant: a readout of the recording would bend them anew."""
+def test_restored_frames_have_no_readout_in_any_format(walk, restored, tmp_path):
+    """Straightened frames show one instant; a readout time would distort them again."""
     files = {"gyroflow": ("lens.json", "frame_readout_time"), "colmap": ("rolling_shutter.json", "readout_time_s")}
     for form, (name, key) in files.items():
         folder, _ = export(walk, tmp_path / form, format=form, restored=restored)
@@ -155,7 +158,7 @@ def test_restored_pictures_have_no_readout_in_any_format(walk, restored, tmp_pat
 
 
 def test_a_run_of_another_capture_is_refused(walk, restored, tmp_path):
-    """A run is told by its name and by its stamps; no folder is left behind."""
+    """A run must match the capture's name and timestamps; no folder is left behind."""
     other = shutil.copytree(walk, tmp_path / "other")
     with pytest.raises(CaptureError, match="run of 'walk'"):
         export(other, tmp_path / "out", restored=restored)
@@ -171,8 +174,8 @@ def test_a_run_of_another_capture_is_refused(walk, restored, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_what_exists_is_not_lost(walk, tmp_path):
-    """An export is replaced only if asked, other folders never, and a failed one leaves the old one and no parts."""
+def test_existing_files_are_kept(walk, tmp_path):
+    """An export is replaced only on request and other folders never; an interrupted export leaves no partial files."""
     folder, _ = export(walk, tmp_path)
     with pytest.raises(OutputError, match="overwrite") as fault:
         export(walk, tmp_path)
@@ -196,8 +199,8 @@ def test_what_exists_is_not_lost(walk, tmp_path):
     assert list((tmp_path / "new").iterdir()) == []
 
 
-def test_unknown_values_are_said_and_left_out(walk, tmp_path):
-    """Without offset and lens the frames are written all the same, with a note each and no invented calibration."""
+def test_unknown_values_are_noted_and_left_out(walk, tmp_path):
+    """Without offset and lens the frames are still exported, with notes and without an invented calibration."""
     bare = shutil.copytree(walk, tmp_path / "bare")
     (bare / "camera.yaml").write_text(
         "virest_profile: 1\nimage: {width: 176, height: 128}\nshutter: {readout_time_s: null}\n"
@@ -215,8 +218,8 @@ def test_unknown_values_are_said_and_left_out(walk, tmp_path):
 
 
 @pytest.mark.scenario
-def test_the_program_exports_and_processes_what_it_exported(walk, tmp_path, virest):
-    """As a process: one JSON object, `process` and `inspect` run on the export, wrong calls end in one line."""
+def test_the_program_processes_its_own_export(walk, tmp_path, virest):
+    """The command prints one JSON object, ``process`` runs on the export, and usage errors have their exit codes."""
     made = virest("export", walk, "--out", tmp_path, "--format", "euroc", "--json")
     assert made.returncode == 0, made.stderr
     facts = json.loads(made.stdout)
@@ -232,8 +235,11 @@ def test_the_program_exports_and_processes_what_it_exported(walk, tmp_path, vire
     assert virest("export", tmp_path / "none", "--out", tmp_path).returncode == 4
 
 
-def test_fields_are_followed_or_said(walk, tmp_path):
-    """A displacement becomes distortion in each format, a rate goes into the samples, times count from the export."""
+def test_fields_are_applied_or_noted(walk, tmp_path):
+    """A displacement becomes distortion in each format and a rate is added to the samples.
+
+    Times count from the export's start.
+    """
     profile = read_profile(walk / "camera.yaml")
     start_ns = read_capture(walk).stamp_0_ns
     across, down = (0.0, 87.5, 175.0), (0.0, 63.5, 127.0)

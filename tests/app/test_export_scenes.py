@@ -1,4 +1,4 @@
-"""Exports for nerfstudio, COLMAP and Gyroflow: read back by pycolmap, and against the truth of a simulated walk."""
+"""Exports for nerfstudio, COLMAP and Gyroflow, checked with pycolmap and with the truth of a simulated walk."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FRAMES = 8
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A camera that walks past a wall, with a lens that bends."""
+    """A camera that walks past a wall, with a distorting lens."""
     folder = tmp_path_factory.mktemp("captures") / "walk"
     simulate_command(folder, width=160, height=120, frames=FRAMES, exposure_ms=8.0, seed=5, readout_ms=18, depth_m=2.0,
                      sway_m=0.1, distortion=("radtan", (-0.08, 0.01, 0.001, -0.002, 0.0)))  # fmt: skip
@@ -31,7 +31,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def poses(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The true trajectory as TUM writes it."""
+    """The true trajectory in TUM's format."""
     rows = np.loadtxt(walk / "truth" / "trajectory.csv", delimiter=",", skiprows=1)
     path = tmp_path_factory.mktemp("poses") / "truth.txt"
     lines = []
@@ -52,7 +52,7 @@ def exported(walk: Path, out: Path, **options: object) -> Path:
 
 
 def test_pycolmap_reads_the_export(walk: Path, poses: Path, tmp_path: Path) -> None:
-    """Camera, pictures and poses are what was written: pixel centres, world to camera, the lens's model."""
+    """Camera, images and poses are read as written: pixel centres, world to camera, the lens model."""
     pycolmap = pytest.importorskip("pycolmap")
     folder = exported(walk, tmp_path, format="colmap", poses=poses)
     model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
@@ -75,7 +75,7 @@ def test_pycolmap_reads_the_export(walk: Path, poses: Path, tmp_path: Path) -> N
 
 
 def test_orientations_come_from_the_gyroscope_without_poses(walk: Path, poses: Path, tmp_path: Path) -> None:
-    """Turns from frame to frame agree with the truth; positions are zero, and no nerfstudio pose is invented."""
+    """Rotations between frames agree with the truth; no nerfstudio pose is invented."""
     free = exported(walk, tmp_path / "free", format="colmap")
     true = exported(walk, tmp_path / "true", format="colmap", poses=poses)
     turns = [_turns(folder) for folder in (free, true)]
@@ -88,14 +88,14 @@ def test_orientations_come_from_the_gyroscope_without_poses(walk: Path, poses: P
 
 
 def _turns(folder: Path) -> list[Rotation]:
-    """World to camera of each picture of a COLMAP text model."""
+    """World-to-camera rotation of each image of a COLMAP text model."""
     lines = (folder / "sparse" / "0" / "images.txt").read_text().splitlines()
     rows = [line.split() for line in lines if line.endswith(".png")]
     return [Rotation.from_quat([float(v) for v in row[1:5]], scalar_first=True) for row in rows]
 
 
 def test_nerfstudio_gets_times_motion_and_opengl_poses(walk: Path, poses: Path, tmp_path: Path) -> None:
-    """A point ahead of the camera has a negative z in OpenGL's axes; rates turn with them; blur is in pixels."""
+    """A point ahead of the camera has a negative z in OpenGL's axes; the blur score is in pixels."""
     folder = exported(walk, tmp_path, format="nerfstudio", poses=poses)
     content = json.loads((folder / "transforms.json").read_text())
     lens = read_profile(walk / "camera.yaml").intrinsics
@@ -113,7 +113,7 @@ def test_nerfstudio_gets_times_motion_and_opengl_poses(walk: Path, poses: Path, 
 
 
 def test_a_gyroflow_profile_has_readout_and_lens(walk: Path, tmp_path: Path) -> None:
-    """Readout in milliseconds, the matrix, and fisheye coefficients that follow the lens."""
+    """The profile has the readout time in milliseconds and fisheye coefficients that fit the lens."""
     content = json.loads((exported(walk, tmp_path, format="gyroflow") / "lens.json").read_text())
     assert content["frame_readout_time"] == pytest.approx(18.0)
     assert content["calib_dimension"] == {"w": 160, "h": 120}
@@ -122,8 +122,8 @@ def test_a_gyroflow_profile_has_readout_and_lens(walk: Path, tmp_path: Path) -> 
     assert content["fisheye_params"]["RMS_error"] < 0.05
 
 
-def test_fisheye_coefficients_follow_a_lens() -> None:
-    """Along the diagonal the equidistant model puts rays where the lens does, and a fisheye lens is left as it is."""
+def test_fisheye_coefficients_fit_a_lens() -> None:
+    """The equidistant model projects rays as the lens does, and a fisheye lens keeps its coefficients."""
     lens = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5, "radtan", (-0.1, 0.02, 0.0, 0.0, 0.0))
     found, error_px = fisheye_coefficients(lens)
     fisheye = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5, "fisheye", found)
@@ -133,7 +133,7 @@ def test_fisheye_coefficients_follow_a_lens() -> None:
     assert fisheye_coefficients(fisheye) == (found, 0.0)
 
 
-def test_what_cannot_be_exported_is_one_line(walk: Path, tmp_path: Path) -> None:
+def test_impossible_exports_are_errors(walk: Path, tmp_path: Path) -> None:
     """An unknown lens and a file that is not a trajectory."""
     (tmp_path / "no.yaml").write_text("virest_profile: 1\nimage: {width: 160, height: 120}\nimu: {time_offset_s: 0}\n")
     (tmp_path / "poses.txt").write_text("1 2 3\n")

@@ -1,4 +1,4 @@
-"""What a run does with its pictures: films, masks, crops, no frames; batches by name and by shard; dry runs."""
+"""Outputs of a run: films, masks, crops, no frames; batches by name and by shard; dry runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def png(path: Path) -> np.ndarray:
 
 
 def film_frames(path: Path) -> tuple[list[float], list[np.ndarray], int]:
-    """Times, pictures and rotation of a film."""
+    """Times, frames and rotation of a film."""
     with av.open(str(path)) as container:
         frames = list(container.decode(video=0))
         return (
@@ -44,8 +44,11 @@ def film_frames(path: Path) -> tuple[list[float], list[np.ndarray], int]:
         )
 
 
-def test_a_film_has_the_movies_times_and_the_frames(swing: Path, virest_here, tmp_path: Path) -> None:
-    """Restored beside recorded frames at the movie's own steps; without frames none stay and the log says so."""
+def test_a_film_has_the_times_and_frames_of_the_movie(swing: Path, virest_here, tmp_path: Path) -> None:
+    """Restored frames stand beside recorded ones at the movie's times.
+
+    ``--no-frames`` writes no frame, and the log says so.
+    """
     film = ("--video", "film.mp4", "--side-by-side", "--no-frames")
     done = virest_here("process", swing, *FAST, "--frames", "2:8", *film)
     assert done.returncode == 0, done.stderr
@@ -69,8 +72,8 @@ def test_a_film_has_the_movies_times_and_the_frames(swing: Path, virest_here, tm
 
 
 @pytest.mark.parametrize("turn", [(0, 1, -1, 0), (-1, 0, 0, -1), (0, -1, 1, 0), UPRIGHT])
-def test_a_film_is_turned_as_the_movie_is(tmp_path: Path, turn: tuple[int, int, int, int]) -> None:
-    """The display matrix that is written is read back, by us and by FFmpeg."""
+def test_a_film_has_the_rotation_of_the_movie(tmp_path: Path, turn: tuple[int, int, int, int]) -> None:
+    """The display matrix of the film is read back by virest and by FFmpeg."""
     picture = np.zeros((48, 64, 3), np.uint8)
     picture[:, :20] = 200
     write_film(tmp_path / "film.mp4", [(0, picture), (40_000_000, picture)], 25.0, turn)
@@ -80,18 +83,20 @@ def test_a_film_is_turned_as_the_movie_is(tmp_path: Path, turn: tuple[int, int, 
     assert rotation in expected
 
 
-def test_side_by_side_is_beside_as_displayed() -> None:
-    """A film that is shown turned by a quarter is stacked, so that recorded stands left of restored."""
+def test_side_by_side_follows_the_displayed_orientation() -> None:
+    """A film displayed with a quarter turn is stacked so that the recorded frame appears left of the restored one."""
     left, right = np.full((4, 6, 3), 10, np.uint8), np.full((4, 6, 3), 20, np.uint8)
     assert side_by_side(left, right, UPRIGHT)[0].tolist() == [[10] * 3] * 6 + [[20] * 3] * 6
-    clockwise = side_by_side(left, right, (0, 1, -1, 0))  # stored x is shown downwards, stored y to the left
+    clockwise = side_by_side(
+        left, right, (0, 1, -1, 0)
+    )  # the stored x axis is displayed downwards, the stored y axis to the left
     assert np.rot90(clockwise, -1)[0, :, 0].tolist() == [10] * 4 + [20] * 4
     assert np.rot90(side_by_side(left, right, (0, -1, 1, 0)), 1)[0, :, 0].tolist() == [10] * 4 + [20] * 4
     assert np.rot90(side_by_side(left, right, (-1, 0, 0, -1)), 2)[0, :, 0].tolist() == [10] * 6 + [20] * 6
 
 
-def test_masks_and_crop_tell_recorded_from_repeated(swing: Path, virest_here, tmp_path: Path) -> None:
-    """A mask covers valid_px; a crop is the part that all frames share, and the run's profile is that of the crop."""
+def test_masks_and_crop_separate_recorded_from_repeated_pixels(swing: Path, virest_here, tmp_path: Path) -> None:
+    """A mask covers valid_px. The crop is the part that all frames share, and the run's profile describes the crop."""
     done = virest_here("process", swing, *FAST, "--mask", "--out", "masked")
     assert done.returncode == 0, done.stderr
     run = tmp_path / "masked" / "swing"
@@ -126,8 +131,8 @@ def test_masks_and_crop_tell_recorded_from_repeated(swing: Path, virest_here, tm
     assert report.returncode == 0, report.stderr
 
 
-def test_a_crop_takes_the_lens_along() -> None:
-    """A ray is seen at the same place of the picture's part, distortion and displacement included."""
+def test_a_crop_keeps_the_lens() -> None:
+    """A ray projects to the same point of the cropped frame, including distortion and displacement."""
     bent = Field("displacement", ("x", "y"), ((0.0, 70.0, 199.0), (0.0, 135.0)), ((1.0, 2.0), (0.5, -1.0)) * 3)
     profile = phone(lens=RADTAN).with_fields([bent])
     part = cropped_profile(profile, (12, 8, 180, 130))
@@ -138,8 +143,8 @@ def test_a_crop_takes_the_lens_along() -> None:
     assert (part.width, part.height) == (168, 122)
 
 
-def test_copied_frames_need_no_picture(tiny: Path, virest_here, tmp_path: Path) -> None:
-    """A run that only copies writes no PNG with --skip-copied, and says so in each line."""
+def test_copied_frames_can_be_skipped(tiny: Path, virest_here, tmp_path: Path) -> None:
+    """With ``--skip-copied``, a run that only copies writes no PNG, and each line of the log says so."""
     profile = tiny / "camera.yaml"
     profile.write_text(profile.read_text().replace("exposure_s: 0.02", "readout_time_s: 0.0"))
     done = virest_here("process", tiny, *FAST, "--deblur", "none", "--shutter", "none", "--skip-copied")
@@ -149,8 +154,8 @@ def test_copied_frames_need_no_picture(tiny: Path, virest_here, tmp_path: Path) 
     assert not list((run / "frames").iterdir())
 
 
-def test_a_run_with_other_pictures_is_not_resumed(tiny: Path, virest_here, tmp_path: Path) -> None:
-    """What a run writes is part of what --resume compares."""
+def test_a_run_with_other_outputs_is_not_resumed(tiny: Path, virest_here, tmp_path: Path) -> None:
+    """``--resume`` also compares the requested outputs."""
     assert virest_here("process", tiny, *FAST, "--frames", "3").returncode == 0
     assert len(lines_of(tmp_path / "virest-out" / "tiny")) == 1
     other = virest_here("process", tiny, *FAST, "--frames", "3", "--mask", "--resume")
@@ -167,15 +172,15 @@ def test_a_run_with_other_pictures_is_not_resumed(tiny: Path, virest_here, tmp_p
         (["--frames", "x"], "not a slice"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(tiny: Path, virest_here, arguments: list[str], says: str) -> None:
-    """One line that says what is missing, exit 2, nothing read."""
+def test_inconsistent_options_are_usage_errors(tiny: Path, virest_here, arguments: list[str], says: str) -> None:
+    """The error names what is missing, with exit code 2."""
     done = virest_here("process", tiny, *arguments)
     assert done.returncode == 2
     assert says in done.stderr
 
 
 def test_a_dry_run_predicts_and_writes_nothing(swing: Path, virest_here, tmp_path: Path) -> None:
-    """Frames, gain, time and bytes of every capture; no folder appears."""
+    """It predicts frames, time and bytes of a capture; no folder appears."""
     done = virest_here("process", swing, *FAST, "--dry-run", "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
@@ -185,8 +190,8 @@ def test_a_dry_run_predicts_and_writes_nothing(swing: Path, virest_here, tmp_pat
     assert not (tmp_path / "virest-out").exists()
 
 
-def test_folders_of_one_name_are_named_by_their_paths(tiny: Path, virest_here, tmp_path: Path) -> None:
-    """Monday's and Tuesday's walk both come out; the same folder twice does not."""
+def test_folders_with_the_same_name_are_named_by_their_paths(tiny: Path, virest_here, tmp_path: Path) -> None:
+    """Two captures with one name are both processed; the same folder given twice is an error."""
     for day in ("monday", "tuesday"):
         shutil.copytree(tiny, tmp_path / day / "walk")
     done = virest_here(
@@ -206,8 +211,8 @@ def test_folders_of_one_name_are_named_by_their_paths(tiny: Path, virest_here, t
     assert "given twice" in twice.stderr
 
 
-def test_shards_share_out_a_batch_under_its_names(tmp_path: Path) -> None:
-    """Every capture is in one shard, and bears the name that it has in the whole batch."""
+def test_shards_divide_a_batch_and_keep_its_names(tmp_path: Path) -> None:
+    """Every capture is in one shard and keeps the name that it has in the whole batch."""
     paths = [str(tmp_path / day / name) for day in ("a", "b") for name in ("walk", f"run-{day}", f"sit-{day}")]
     parts = [shard_of(paths, (part, 4)) for part in (1, 2, 3, 4)]
     assert sorted(path for found, _ in parts for path in found) == sorted(paths)
@@ -219,7 +224,7 @@ def test_shards_share_out_a_batch_under_its_names(tmp_path: Path) -> None:
 
 
 def test_the_table_fits_a_terminal_and_names_the_next_command(tiny: Path, virest_here, tmp_path: Path) -> None:
-    """80 columns hold the table of a batch with long names; the last line says what helps."""
+    """The table of a batch with long names fits 80 columns; the last line suggests the next command."""
     long = tmp_path / ("a_capture_with_a_rather_long_name_" * 2)
     shutil.copytree(tiny, long)
     done = virest_here("process", tiny, long, *FAST, "--frames", "0:1")

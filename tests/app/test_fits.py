@@ -1,4 +1,4 @@
-"""The bench's fits: known constants come back from made-up gains."""
+"""The bench's fits recover known constants from synthetic gains."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from virest.app.bench.fits import best_value, fit_left_over, fit_workloads
 from virest.app.bench.workload import Scale, honesty_workloads
 
 
-def test_known_coefficients_come_back():
-    """Gains made by a law, with a little noise, give the law again within its deviations."""
+def test_known_coefficients_are_recovered():
+    """Gains that follow a law, with a little noise, give its coefficients."""
     rng, law = np.random.default_rng(3), np.array([1.0, 0.5, 0.2, 0.3, 0.6])
     rows = []
     for k in range(240):
@@ -27,14 +27,14 @@ def test_known_coefficients_come_back():
 
 
 def test_the_best_value_lies_between_those_tried():
-    """A hill over the logarithm is found between its samples, and captures that differ give a deviation."""
+    """A maximum over the logarithm is found between its samples, and differing captures give a standard deviation."""
     values, shift = (0.03, 0.06, 0.1, 0.15, 0.25), np.linspace(-0.1, 0.1, 5)[:, None]
     found = best_value(values, -((np.log(values) - np.log(0.08) - shift) ** 2))
     assert found["best"] == pytest.approx(0.08, rel=0.05)
     assert 0 < found["std"] < 0.02
 
 
-def test_what_is_fitted_is_not_what_is_judged():
-    """No capture has the seed of one that judges."""
+def test_fitted_and_judged_captures_are_disjoint():
+    """No fitted capture shares a seed with a capture of the honesty bench."""
     judged = {w.name: w.options["seed"] for w in honesty_workloads(Scale())}
     assert not {w.options["seed"] for w in fit_workloads(Scale())} & set(judged.values())

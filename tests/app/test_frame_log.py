@@ -1,4 +1,4 @@
-"""The log's line: made from a frame's record, the same keys for every status."""
+"""A line of the log, made from a frame's record, has the same keys for every status."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _line(restored: RestoredFrame) -> dict:
 
 
 def test_every_line_has_the_same_keys_in_the_same_order() -> None:
-    """Restored, copied or failed."""
+    """The status (restored, copied or failed) changes no key."""
     frames = [
         RestoredFrame(FRAME, "restored", PICTURE, degradation=FOUND),
         RestoredFrame(FRAME, "copied", PICTURE, degradation=unknown_parameters(PROFILE)),
@@ -63,8 +63,8 @@ def test_every_line_has_the_same_keys_in_the_same_order() -> None:
     assert lines[0]["seconds"] == {"decode": 0.1235}
 
 
-def test_a_record_is_written_and_read_by_its_fields_names() -> None:
-    """Nested records are mappings, tuples lists."""
+def test_a_record_is_written_with_its_field_names() -> None:
+    """Nested records become mappings and tuples become lists."""
     line = _line(RestoredFrame(FRAME, "restored", PICTURE, degradation=FOUND))
     assert line["blur"]["tiles"][1] == {"centre_px": [48.0, 24.0], "angle_rad": 0.4, "length_px": 4.0}
     assert line["shutter"]["corners_px"][2] == [63.0, 48.0]
@@ -73,8 +73,8 @@ def test_a_record_is_written_and_read_by_its_fields_names() -> None:
     assert {name: line[name] for name in FOUND.as_json()} == FOUND.as_json()
 
 
-def test_what_was_done_follows_from_the_record() -> None:
-    """Steps are named for restored frames alone."""
+def test_the_steps_done_follow_from_the_record() -> None:
+    """Only restored frames list steps."""
     plain = replace(FOUND, deblur=None)
     still = replace(plain, shutter=replace(FOUND.shutter, method="none"))
     frames = (

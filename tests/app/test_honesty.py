@@ -1,4 +1,4 @@
-"""The honesty bench: what its tables say of given promises and gains."""
+"""The honesty bench's tables for given predictions and gains."""
 
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,8 @@ HONEST_ROWS = [
 ]
 
 
-def test_honesty_counts_losses_and_the_promises_made_for_them() -> None:
-    """Of the phones' four frames two are worse, by 1 dB in the mean; the median miss of three promises is 1.5 dB."""
+def test_honesty_counts_losses_and_their_predicted_gains() -> None:
+    """Two of the phones' four frames lose 1 dB on average; the median error of three predictions is 1.5 dB."""
     found = {(e["set"], e["capture"]): e for e in honesty.summarise_honesty(HONEST_ROWS)}
     phones = found["phone", None]
     assert (phones["of"], phones["deblurred"], phones["promised"], phones["promised_and_worse"]) == (4, 3, 3, 2)
@@ -41,8 +41,11 @@ def test_honesty_counts_losses_and_the_promises_made_for_them() -> None:
     assert found["phone", "dim"]["of"] == 1
 
 
-def test_the_honesty_tables_mark_every_frame_that_was_made_worse() -> None:
-    """A line a frame, promise beside gain; the summary judges each set, the gain of the phones alone."""
+def test_the_honesty_tables_mark_every_frame_that_got_worse() -> None:
+    """Each frame has a line with predicted and measured gain.
+
+    The summary judges each set, and the mean gain only for phones.
+    """
     lines = honesty.frames_text(HONEST_ROWS[1:4], ["fast"]).splitlines()[1:]
     assert [line.endswith("!") for line in lines] == [True, False, False]
     assert "+1.00 / -0.50" in lines[0]
@@ -58,15 +61,15 @@ def test_the_honesty_tables_mark_every_frame_that_was_made_worse() -> None:
     assert "ALL PHONE" in honesty.honesty_text(honesty.summarise_honesty(HONEST_ROWS))
 
 
-def test_fewer_promises_missed_and_fewer_frames_made_worse_is_better() -> None:
-    """The comparison of two reports knows the directions; a set's record is found again by its name."""
+def test_the_comparison_knows_the_better_direction_of_honesty_figures() -> None:
+    """Smaller prediction errors, smaller shares of worse frames and a higher worst gain are better."""
     assert compare.better_direction("honesty.summary[phone fast].promise_off") == -1
     assert compare.better_direction("honesty.summary[phone fast].worse_share") == -1
     assert compare.better_direction("honesty.summary[phone fast].worst_db") == 1
 
 
-def test_phones_are_measured_in_both_sections_and_their_profile_is_the_nominal_one() -> None:
-    """The defocused captures alone get the true profile: nothing is wrong with it, and still it must do no harm."""
+def test_phones_are_measured_in_both_sections_with_the_nominal_profile() -> None:
+    """Only the defocused captures get a profile of their own: deblurring must do no harm even with the true profile."""
     phones = {"phone-calm", "phone-fast", "phone-stabilised", "phone-dim"}
     for scale in (Scale(), Scale(quick=True)):
         assert phones <= {w.name for w in quality_workloads(scale)}
@@ -78,8 +81,8 @@ def test_phones_are_measured_in_both_sections_and_their_profile_is_the_nominal_o
     assert len(honesty_workloads(Scale(quick=True))) == 4
 
 
-def test_the_quality_table_of_one_kind_measures_that_kind_alone() -> None:
-    """The six shaken scenes are not among the quick ones, but a look at their kind measures four frames of each."""
+def test_the_quality_table_of_one_kind_measures_only_that_kind() -> None:
+    """The six shaken scenes are not in the quick set; selecting their kind measures four frames of each."""
     assert not [w for w in quality_workloads(Scale(quick=True)) if w.kind == "shaken"]
     for scale, frames in ((Scale(kinds=("shaken",)), 8), (Scale(quick=True, kinds=("shaken",)), 4)):
         chosen = quality_workloads(scale)
@@ -88,8 +91,8 @@ def test_the_quality_table_of_one_kind_measures_that_kind_alone() -> None:
     assert len(quality_workloads(Scale())) == len({w.name for w in quality_workloads(Scale())})
 
 
-def test_a_kept_capture_is_used_again_only_if_it_is_the_same(tmp_path: Path) -> None:
-    """The same options: not touched; others: made anew under its name."""
+def test_a_cached_capture_is_reused_only_with_the_same_options(tmp_path: Path) -> None:
+    """With other options it is simulated again under the same name."""
     options = {"width": 64, "height": 48, "frames": 2, "exposure_ms": 4.0}
     movie = simulated(tmp_path, "small", **options) / "movie.mp4"
     first = movie.stat().st_mtime_ns

@@ -1,4 +1,4 @@
-"""Names and files made to hurt, through the program: one line, the right exit code, nothing written elsewhere."""
+"""Hostile names and files given to the program: one error line, the right exit code, no file written elsewhere."""
 
 import os
 from pathlib import Path
@@ -11,7 +11,7 @@ from virest.errors import OutputError
 
 
 def refused(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:
-    """The exit code and the one line of a call that is refused."""
+    """The exit code and the error line of a rejected call."""
     code = run(["process", *map(str, arguments)])
     output, errors = capfd.readouterr()
     lines = [line for line in errors.splitlines() if line.startswith("virest: error: ")]
@@ -24,7 +24,7 @@ def refused(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[int,
 
 @pytest.mark.parametrize("name", ["a" * 4096, "a" * 255 + "/" + "b" * 255 + "x", "é" * 2000, "x/" * 2000])
 def test_names_of_four_kilobytes_are_refused(capfd: pytest.CaptureFixture[str], tmp_path: Path, name: str) -> None:
-    """The line shows the beginning only."""
+    """The error line shows only the beginning of the name."""
     code, _ = refused(capfd, tmp_path / name, "--out", tmp_path / "out")
     assert code == 4
     assert not (tmp_path / "out").exists()
@@ -32,7 +32,7 @@ def test_names_of_four_kilobytes_are_refused(capfd: pytest.CaptureFixture[str], 
 
 @pytest.mark.parametrize("name", ["a\nb", "a\x1b[2Jb", "a\x7f", "a\x9bb", "a\u2028b"])
 def test_control_characters_are_refused(capfd: pytest.CaptureFixture[str], tmp_path: Path, name: str) -> None:
-    """They would write on the screen of whoever reads the log."""
+    """They could manipulate the terminal of whoever reads the log."""
     (tmp_path / name).mkdir()
     code, line = refused(capfd, tmp_path / name, "--out", tmp_path / "out")
     assert code == 8
@@ -40,7 +40,7 @@ def test_control_characters_are_refused(capfd: pytest.CaptureFixture[str], tmp_p
 
 
 def test_names_with_dots_never_lead_out_of_the_output_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are resolved first; what has no name of its own is refused."""
+    """Paths are resolved first; a path without a name of its own is refused."""
     (tmp_path / "a/b").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "a")
     assert capture_name("b/../../a/b") == "b"
@@ -54,7 +54,7 @@ def test_names_with_dots_never_lead_out_of_the_output_folder(tmp_path: Path, mon
 
 
 def test_loops_of_links_are_refused(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """As a capture, and as a file of one."""
+    """A capture folder or a file in it may be a loop of symbolic links."""
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     assert refused(capfd, tmp_path / "loop", "--out", tmp_path / "out")[0] == 4
     (tmp_path / "one").mkdir()
@@ -67,7 +67,7 @@ def test_loops_of_links_are_refused(capfd: pytest.CaptureFixture[str], tmp_path:
 def test_a_pipe_for_a_profile_or_settings_does_not_hang(
     capfd: pytest.CaptureFixture[str], tmp_path: Path, option: str
 ) -> None:
-    """Nobody writes into it."""
+    """No process writes into the pipe."""
     os.mkfifo(tmp_path / "file.yaml")
     (tmp_path / "one").mkdir()
     assert refused(capfd, tmp_path / "one", option, tmp_path / "file.yaml", "--out", tmp_path / "out")[0] == 3
@@ -88,8 +88,8 @@ def test_a_pipe_for_a_profile_or_settings_does_not_hang(
         "deblur: " + "x" * 900_000,
     ],
 )
-def test_settings_made_to_hurt_are_refused(capfd: pytest.CaptureFixture[str], tmp_path: Path, text: str) -> None:
-    """Tags, bombs, endless numbers, depths: exit 3."""
+def test_hostile_settings_are_refused(capfd: pytest.CaptureFixture[str], tmp_path: Path, text: str) -> None:
+    """Tags, YAML bombs, huge numbers and deep nesting exit with 3."""
     (tmp_path / "one").mkdir()
     (tmp_path / "s.yaml").write_text(text + "\n")
     assert refused(capfd, tmp_path / "one", "--settings", tmp_path / "s.yaml", "--out", tmp_path / "out")[0] == 3
@@ -99,7 +99,7 @@ def test_settings_made_to_hurt_are_refused(capfd: pytest.CaptureFixture[str], tm
 def test_pipes_in_the_output_folder_do_not_hang(
     capfd: pytest.CaptureFixture[str], tiny: Path, tmp_path: Path, name: str
 ) -> None:
-    """A folder that is none of ours is refused, whatever stands in it."""
+    """A folder that is not a run is refused, whatever it contains."""
     (tmp_path / "out/tiny").mkdir(parents=True)
     os.mkfifo(tmp_path / "out/tiny" / name)
     os.mkfifo(tmp_path / "out/tiny/another")

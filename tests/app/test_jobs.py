@@ -1,4 +1,4 @@
-"""Segments: cut the same way for any number of jobs, idempotent, and each frame's fault its own."""
+"""Segments: the same cuts for any number of jobs, repeatable, and a frame's failure affects only that frame."""
 
 import json
 import os
@@ -39,7 +39,7 @@ def grey(index: int) -> np.ndarray:
 
 @pytest.fixture
 def segment(tmp_path: Path) -> Segment:
-    """Frames 4, 5, 6, 7 of which 6 is left out."""
+    """Frames 4 to 7; frame 6 is skipped."""
     frames = frames_of(4, 5, 7)
     frames.insert(2, Frame(6, 10**9, 0.198, 0.01, skip_reason="inside an IMU gap"))
     imu = ImuSamples(np.arange(0, 1, 0.01), np.zeros((100, 3)), np.zeros((100, 3)))
@@ -53,7 +53,7 @@ def segment(tmp_path: Path) -> Segment:
 
 @pytest.fixture
 def decoder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put a decoder in place that cannot decode certain frames, or ends early."""
+    """Install a decoder that cannot decode certain frames or ends early."""
 
     def install(broken: tuple[int, ...] = (), ends_at: int | None = None) -> None:
         def read(path: Path, index: MovieIndex, first: int, last: int, *_: Any) -> Iterator[tuple[int, Any]]:
@@ -69,14 +69,14 @@ def decoder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def restore_all(frames: Any, imu: ImuSamples, plan: RestorationPlan, *_: Any) -> Iterator[RestoredFrame]:
-    """Stand in for the restoration: brighter by 100."""
+    """A substitute for the restoration: adds 100 to each pixel."""
     for frame, picture in frames:
         yield RestoredFrame(frame, "restored", picture + 100, valid_px=(0, 0, WIDTH, HEIGHT), seconds={"deblur": 0.5})
 
 
 @pytest.fixture
 def restoration(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
-    """Put a restoration in place."""
+    """Install a substitute for the restoration."""
 
     def install(function: Any) -> None:
         monkeypatch.setattr(segments, "restore_frames", function)
@@ -91,12 +91,12 @@ def lines_of(segment: Segment) -> list[dict[str, Any]]:
 
 
 def statuses(segment: Segment) -> list[str]:
-    """Give each frame's status."""
+    """Each frame's status."""
     return [line["status"] for line in lines_of(segment)]
 
 
 def pictures(segment: Segment) -> set[str]:
-    """Give the names of the pictures written."""
+    """Names of the written pictures."""
     return {path.name for path in segment.run.frames.iterdir()}
 
 
@@ -112,25 +112,25 @@ def test_cuts_lie_at_key_frames_and_keep_segments_short() -> None:
 
 
 def test_segments_grow_with_the_distance_from_the_key_frame() -> None:
-    """A movie with one key frame is not decoded again and again for a few frames each."""
+    """Longer segments avoid decoding a movie with one key frame again and again for a few frames."""
     lengths = [len(part) for part in cut_frames(frames_of(*range(300)), (0,))]
     assert lengths[:4] == [10, 10, 10, 15]
     assert max(lengths) == 30
 
 
-def test_cuts_of_every_fifth_frame_fall_where_a_key_frame_was_passed() -> None:
-    """A key frame between two chosen frames is as good as one at the second."""
+def test_cuts_of_every_fifth_frame_follow_skipped_key_frames() -> None:
+    """A key frame between two selected frames is as good as one at the second."""
     parts = cut_frames(frames_of(*range(0, 100, 5)), (0, 48))
     assert [part[0].index for part in parts] == [0, 50]
 
 
 def test_no_frames_make_no_segments() -> None:
-    """An empty selection is no work."""
+    """An empty selection needs no work."""
     assert cut_frames([], (0,)) == []
 
 
 def test_imu_samples_cover_the_frames_on_the_imus_clock() -> None:
-    """The clock's offset is applied before samples are cut out, and a second is spared on both sides."""
+    """The clock offset is applied before samples are cut, and the cut keeps a margin of 1 s on both sides."""
     imu = ImuSamples(np.arange(0, 100, 0.01), np.zeros((10000, 3)), np.zeros((10000, 3)))
     plan = RestorationPlan(CameraProfile(64, 48, time_offset_s=50.0), RestorationSettings(), (), None)
     cut = cut_imu(imu, frames_of(0, 30), plan)
@@ -138,8 +138,8 @@ def test_imu_samples_cover_the_frames_on_the_imus_clock() -> None:
     assert 51.9 < cut.time_s[-1] < 52.2
 
 
-def test_a_segment_is_plain_data(segment: Segment) -> None:
-    """It can go to a worker on another machine."""
+def test_a_segment_can_be_pickled(segment: Segment) -> None:
+    """It can be sent to a worker on another machine."""
     again = pickle.loads(pickle.dumps(segment))
     assert again.frames == segment.frames
     assert again.plan == segment.plan
@@ -150,7 +150,7 @@ def test_a_segment_is_plain_data(segment: Segment) -> None:
 
 @pytest.mark.usefixtures("decoder", "restoration")
 def test_each_frame_of_a_segment_has_its_line(segment: Segment) -> None:
-    """In frame order, with all keys of the contract; only frames with a picture have an output."""
+    """Lines come in frame order with all documented keys; only frames with a picture have an output."""
     assert run_segment(segment) == {"restored": 3, "skipped": 1}
     lines = lines_of(segment)
     assert [line["frame"] for line in lines] == [4, 5, 6, 7]
@@ -166,8 +166,8 @@ def test_each_frame_of_a_segment_has_its_line(segment: Segment) -> None:
 
 
 @pytest.mark.usefixtures("decoder", "restoration")
-def test_a_segment_done_twice_gives_the_same_files(segment: Segment) -> None:
-    """A segment is idempotent."""
+def test_a_segment_processed_twice_gives_the_same_files(segment: Segment) -> None:
+    """Processing a segment again writes the same bytes."""
     run_segment(segment)
     before = {path.name: path.read_bytes() for path in segment.run.frames.iterdir()}
     run_segment(segment)
@@ -176,7 +176,7 @@ def test_a_segment_done_twice_gives_the_same_files(segment: Segment) -> None:
 
 @pytest.mark.usefixtures("restoration")
 def test_a_frame_that_cannot_be_decoded_fails_alone(segment: Segment, decoder: Callable[..., None]) -> None:
-    """Its line says so; the others are restored."""
+    """Its line gives the reason; the other frames are restored."""
     decoder(broken=(5,))
     assert run_segment(segment) == {"restored": 2, "skipped": 1, "failed": 1}
     assert statuses(segment) == ["restored", "failed", "skipped", "restored"]
@@ -185,7 +185,7 @@ def test_a_frame_that_cannot_be_decoded_fails_alone(segment: Segment, decoder: C
 
 @pytest.mark.usefixtures("restoration")
 def test_a_movie_that_ends_early_fails_its_last_frames(segment: Segment, decoder: Callable[..., None]) -> None:
-    """What could be read is kept."""
+    """Frames that could be decoded are restored."""
     decoder(ends_at=7)
     run_segment(segment)
     assert statuses(segment) == ["restored", "restored", "skipped", "failed"]
@@ -196,7 +196,7 @@ def test_a_movie_that_ends_early_fails_its_last_frames(segment: Segment, decoder
 def test_a_frame_that_cannot_be_restored_fails_alone(
     segment: Segment, restoration: Callable[[Any], None], *, look_ahead: bool
 ) -> None:
-    """Even when the restoration had taken later frames already."""
+    """The restoration may have read later frames already."""
 
     def restore(frames: Any, imu: ImuSamples, plan: RestorationPlan, *_: Any) -> Iterator[RestoredFrame]:
         for frame, picture in list(frames) if look_ahead else frames:
@@ -213,7 +213,7 @@ def test_a_frame_that_cannot_be_restored_fails_alone(
 
 @pytest.mark.usefixtures("decoder", "restoration")
 def test_a_full_disk_ends_the_segment_and_leaves_no_log(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fault of the disk is no fault of a frame."""
+    """A disk error is not attributed to a frame."""
 
     def full(path: Path, data: bytes) -> None:
         raise OSError(28, os.strerror(28))
@@ -235,8 +235,8 @@ def one_frame_segments(segment: Segment, count: int) -> list[Segment]:
 
 
 @pytest.mark.usefixtures("decoder", "restoration")
-def test_segments_are_made_only_as_they_are_needed(segment: Segment) -> None:
-    """Memory does not grow with the movie: no more segments are in flight than there are slots."""
+def test_segments_are_created_on_demand(segment: Segment) -> None:
+    """Memory does not grow with the movie: there are no more segments in flight than slots."""
     made: list[int] = []
 
     def make() -> Iterator[Segment]:
@@ -250,10 +250,8 @@ def test_segments_are_made_only_as_they_are_needed(segment: Segment) -> None:
 
 
 @pytest.mark.usefixtures("decoder")
-def test_a_fault_of_ours_fails_one_segment_and_the_rest_goes_on(
-    segment: Segment, restoration: Callable[[Any], None]
-) -> None:
-    """The frames' lines say what happened."""
+def test_an_internal_error_fails_one_segment(segment: Segment, restoration: Callable[[Any], None]) -> None:
+    """The other segments are restored."""
 
     def restore(frames: Any, imu: ImuSamples, plan: RestorationPlan, *_: Any) -> Iterator[RestoredFrame]:
         for frame, picture in frames:
@@ -274,8 +272,8 @@ def _die_on_second(segment: Segment) -> dict[str, int]:
 
 
 @pytest.mark.scenario
-def test_a_worker_that_dies_takes_only_its_own_segment(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lost segments are tried again, each alone; the one that kills its worker again fails, the others are done."""
+def test_a_dying_worker_fails_only_its_own_segment(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lost segments are retried one at a time; only the one that kills its worker again fails for that reason."""
     monkeypatch.setattr(jobs, "run_segment", _die_on_second)
     workers = Workers(2)
     parts = one_frame_segments(segment, 5)
@@ -286,7 +284,7 @@ def test_a_worker_that_dies_takes_only_its_own_segment(segment: Segment, monkeyp
     assert ["died" in reason for reason in reasons] == [False, False, True, False, False]
 
 
-# ── calls ahead of their turn ────────────────────────────────────────────────────────────────────────────────────
+# ── prefetched calls ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _square_or_die(number: int) -> int:
@@ -298,8 +296,8 @@ def _square_or_die(number: int) -> int:
 
 
 @pytest.mark.scenario
-def test_a_call_that_kills_its_worker_fails_alone() -> None:
-    """Its neighbours' results come all the same, in order; an error is raised when its turn comes."""
+def test_a_call_that_kills_its_worker_fails_only_itself() -> None:
+    """The results of the other calls arrive in order; an error is raised when its result is requested."""
     workers = Workers(2)
     ahead = PrefetchedCalls(_square_or_die, [(number,) for number in range(6)], workers)
     results: list[Any] = []

@@ -25,7 +25,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 def test_kept_memory_is_not_fetched_again() -> None:
-    """Pictures made and dropped in turn touch new pages by the ten thousand, and hardly any once memory is kept."""
+    """Allocating and freeing pictures causes thousands of page faults, and hardly any once memory is kept."""
     faults = [
         int(subprocess.run([sys.executable, "-c", PROGRAM.format(keep=keep)], capture_output=True, check=True).stdout)
         for keep in ("", "keep_freed_memory()")
@@ -33,6 +33,6 @@ def test_kept_memory_is_not_fetched_again() -> None:
     assert faults[1] < 0.05 * max(faults[0], 2000)
 
 
-def test_asking_twice_does_no_harm() -> None:
-    """The answer is the same."""
+def test_keeping_memory_twice_is_harmless() -> None:
+    """The return value is the same."""
     assert keep_freed_memory() == keep_freed_memory()

@@ -1,4 +1,4 @@
-"""`virest --man`: a page that roff takes without a warning and that says what `--help` says."""
+"""``virest --man``: a page that roff accepts without a warning and that matches ``--help``."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def plain(roff: str) -> str:
 
 
 def commands_of(command: Any, name: str) -> list[tuple[str, Any]]:
-    """A command with its path, and its own commands."""
+    """A command with its path, and its subcommands."""
     own = getattr(command, "commands", {}).items()
     return [(name, command), *(found for inner, sub in own for found in commands_of(sub, f"{name} {inner}"))]
 
 
 def test_the_page_has_every_command_and_option(virest_here: Any) -> None:
-    """Each command has its section, and in it the help of each of its options and the lines of its examples."""
+    """Each command has a section with its options and the lines of its examples."""
     done = virest_here("--man")
     assert done.returncode == 0
     sections = dict(zip(*[iter(re.split(r"^\.SS (.*)\n", done.stdout, flags=re.MULTILINE)[1:])] * 2, strict=True))
@@ -45,15 +45,15 @@ def test_the_page_has_every_command_and_option(virest_here: Any) -> None:
 
 
 def test_exit_codes_are_the_documented_ones() -> None:
-    """The page's table is that of docs/exit-codes.md."""
+    """The page's table matches docs/exit-codes.md."""
     table = re.findall(r"^\| (\d+) \| (.*) \|$", (ROOT / "docs/exit-codes.md").read_text("utf-8"), re.MULTILINE)
     said = [(int(code), re.sub(r" \(.*\)$", "", meaning).replace("`", "")) for code, meaning in table]
     assert said == list(EXIT_CODES)
 
 
 @pytest.mark.skipif(shutil.which("groff") is None, reason="groff is not installed")
-def test_roff_takes_the_page_without_a_warning() -> None:
-    """No request that groff does not know, and a name line that indexers read."""
+def test_roff_accepts_the_page_without_a_warning() -> None:
+    """groff knows every request, and indexers can read the NAME line."""
     page = man_page(program())
     assert re.search(r"^\.SH NAME\nvirest \\- [A-Z]", page, re.MULTILINE)
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""The program where there is no fcntl, no signal mask and no hang-up; what it says when it is interrupted."""
+"""The program on systems without fcntl, signal masks and SIGHUP, and its message when it is interrupted."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ virest.app.cli.main()
 
 
 def test_the_program_starts_on_a_system_without_unix_calls(tmp_path: Path) -> None:
-    """Windows locks a run's folder by msvcrt, and lacks the signals that are handled elsewhere."""
+    """Windows locks a run's folder with msvcrt and lacks some of the signals."""
     done = subprocess.run([sys.executable, "-c", WITHOUT, tmp_path], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "virest" in done.stdout
 
 
 @pytest.mark.parametrize(("command", "goes_on"), [("process", True), ("calibrate", False), ("diagnose", False)])
-def test_only_process_speaks_of_resume(monkeypatch: pytest.MonkeyPatch, command: str, goes_on: bool) -> None:
-    """Other commands have nothing to go on from."""
+def test_only_process_mentions_resume(monkeypatch: pytest.MonkeyPatch, command: str, goes_on: bool) -> None:
+    """Other commands cannot be resumed."""
     said: list[str] = []
 
     monkeypatch.setattr(console.CONSOLE, "line", said.append)
@@ -53,8 +53,8 @@ class _Interrupted:
         raise KeyboardInterrupt
 
 
-def test_a_batch_in_which_all_captures_failed_is_9(virest, tmp_path: Path) -> None:
-    """One capture gives its own code, two give 9 though none was done."""
+def test_a_batch_in_which_all_captures_fail_exits_with_9(virest, tmp_path: Path) -> None:
+    """One capture gives its own code; two give 9 even if both fail."""
     nothing = [tmp_path / "a", tmp_path / "b"]
     assert virest("process", nothing[0], "--out", tmp_path / "out").returncode == 4
     assert virest("process", *nothing, "--out", tmp_path / "out").returncode == 9

@@ -1,4 +1,4 @@
-"""What a run writes appears whole or not at all, and a run's folder tells its own state."""
+"""Files of a run are written completely or not at all, and a run's folder shows its own state."""
 
 import errno
 import json
@@ -32,7 +32,7 @@ def names(folder: Path) -> set[str]:
 
 
 def fail_with(run: RunFolder, segments: tuple[int, ...]) -> None:
-    """Fail while frame 1 is being written, with these segments finished."""
+    """Fail while frame 1 is being written, after the given segments are finished."""
     (run.frames / "000000.png").write_bytes(b"done")
     (run.frames / "000001.png.0123abcd.part").write_bytes(b"half")
     for frame in segments:
@@ -49,8 +49,8 @@ def finish(run: RunFolder) -> None:
         run_folder.finish_run(run, [log], REQUEST)
 
 
-def test_a_picture_comes_back_as_it_was(tmp_path: Path, rng: np.random.Generator) -> None:
-    """PNG is lossless, and red stays red."""
+def test_a_picture_reads_back_unchanged(tmp_path: Path, rng: np.random.Generator) -> None:
+    """PNG is lossless, and the colour order is kept."""
     picture = rng.integers(0, 256, (7, 11, 3), np.uint8)
     write_picture(tmp_path / "000000.png", picture)
     assert np.array_equal(cv2.imread(str(tmp_path / "000000.png"))[..., ::-1], picture)
@@ -58,10 +58,10 @@ def test_a_picture_comes_back_as_it_was(tmp_path: Path, rng: np.random.Generator
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
-def test_a_write_that_fails_leaves_nothing_and_keeps_the_old_file(
+def test_a_failed_write_leaves_nothing_and_keeps_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    """A full or read-only disk is an OutputError with what to do next; no part stays."""
+    """A full or read-only disk is an OutputError with a hint; no partial file stays."""
 
     def half(path: Path, data: bytes) -> None:
         path.write_bytes(data[:2])
@@ -76,8 +76,8 @@ def test_a_write_that_fails_leaves_nothing_and_keeps_the_old_file(
     assert (tmp_path / "run.json").read_bytes() == b"old"
 
 
-def test_a_write_that_is_interrupted_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C in the middle of a file takes the half away."""
+def test_an_interrupted_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C during a write removes the partial file."""
 
     def interrupted(path: Path, data: bytes) -> None:
         path.write_bytes(data[:2])
@@ -90,29 +90,29 @@ def test_a_write_that_is_interrupted_leaves_nothing(tmp_path: Path, monkeypatch:
 
 
 def test_json_has_no_nan_and_no_infinity() -> None:
-    """NaN becomes null, infinity the text inf, arrays lists."""
+    """NaN becomes null, infinity the text "inf", and arrays become lists."""
     value = {"a": math.nan, "b": [math.inf, -np.inf], "c": np.float32(0.5), "d": np.arange(2), "e": (True, None, 7)}
     assert json.loads(json_line(value)) == {
         "a": None, "b": ["inf", "-inf"], "c": 0.5, "d": [0, 1], "e": [True, None, 7]
     }  # fmt: skip
 
 
-def test_time_stamps_keep_all_their_digits() -> None:
-    """Nanoseconds are integers and are not rounded; numbers lose only what no one measured."""
+def test_timestamps_keep_all_their_digits() -> None:
+    """Nanoseconds are integers and are not rounded; other numbers lose only meaningless digits."""
     assert plain(90274601234567891) == 90274601234567891
     assert plain(0.1 + 0.2) == 0.3
 
 
 def test_a_captures_name_is_the_last_part_of_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`.` and `..` resolve to their folders' names, a slash at the end does not matter."""
+    """``.`` and ``..`` resolve to their folders' names, and a trailing slash does not matter."""
     (tmp_path / "trip" / "in").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "trip" / "in")
     assert [capture_name(path) for path in (".", "..", "../in/", "x/../y")] == ["in", "trip", "in", "y"]
 
 
 @pytest.mark.parametrize("path", ["/", "a\nb", "a\x1b[2J", "x/\x7f"])
-def test_a_name_that_is_no_folder_name_is_refused(path: str) -> None:
-    """Names from data never leave the output folder nor reach the terminal raw."""
+def test_a_name_that_is_not_a_folder_name_is_refused(path: str) -> None:
+    """Names from data never leave the output folder and never reach the terminal unescaped."""
     with pytest.raises(OutputError) as caught:
         capture_name(path)
     assert "\n" not in str(caught.value)
@@ -120,7 +120,7 @@ def test_a_name_that_is_no_folder_name_is_refused(path: str) -> None:
 
 
 def test_a_finished_run_is_refused_without_overwrite(tmp_path: Path) -> None:
-    """The hint names the way out; nothing is touched."""
+    """The hint names the option; no file changes."""
     run = RunFolder(tmp_path / "out" / "trip")
     finish(run)
     before = names(run.path)
@@ -133,8 +133,8 @@ def test_a_finished_run_is_refused_without_overwrite(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
-def test_a_run_killed_in_its_first_moment_is_no_obstacle(tmp_path: Path, mode: str) -> None:
-    """Half of its request is no foreign file, and goes."""
+def test_a_run_killed_at_its_very_start_does_not_block_a_new_one(tmp_path: Path, mode: str) -> None:
+    """A partial request is not a foreign file and is removed."""
     run = RunFolder(tmp_path / "trip")
     run.path.mkdir()
     (run.path / ".run.0123abcd.part").write_bytes(b"half")
@@ -146,8 +146,8 @@ def test_a_run_killed_in_its_first_moment_is_no_obstacle(tmp_path: Path, mode: s
         check_run(run, REQUEST, "overwrite")
 
 
-def test_a_run_killed_in_its_last_moment_is_cleared_away_by_resume(tmp_path: Path) -> None:
-    """It is finished, but its scaffolding still stands."""
+def test_resume_cleans_up_a_run_killed_at_its_very_end(tmp_path: Path) -> None:
+    """The run is finished, but its temporary files still exist."""
     run = RunFolder(tmp_path / "trip")
     finish(run)
     run.segments.mkdir()
@@ -168,8 +168,8 @@ def test_a_run_killed_in_its_last_moment_is_cleared_away_by_resume(tmp_path: Pat
         ({"version": "9"}, "version"),
     ],
 )
-def test_resume_with_another_request_is_refused_and_says_what_differs(tmp_path: Path, change: dict, says: str) -> None:
-    """A run is continued only as it was begun."""
+def test_resume_with_another_request_is_refused_with_the_difference(tmp_path: Path, change: dict, says: str) -> None:
+    """A run can be resumed only with the request that started it."""
     run = RunFolder(tmp_path / "trip")
     finish(run)
     with pytest.raises(OutputError, match="--resume") as caught:
@@ -181,8 +181,8 @@ FAILURE = {"virest_run": 1, "profile_sha256": None, "failure": {"error": "ImuErr
 
 
 @pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
-def test_the_account_of_a_failure_is_no_obstacle(tmp_path: Path, mode: str) -> None:
-    """It says why, is replaced by that of a later failure, and goes when a run begins."""
+def test_a_failure_record_does_not_block_a_run(tmp_path: Path, mode: str) -> None:
+    """It states the reason, is replaced by that of a later failure, and is removed when a run begins."""
     run = RunFolder(tmp_path / "out/trip")
     for reason in ("empty", "of another session"):
         assert write_failure(run, {**FAILURE, "failure": {"reason": reason}})
@@ -196,8 +196,8 @@ def test_the_account_of_a_failure_is_no_obstacle(tmp_path: Path, mode: str) -> N
     assert not run.path.exists() or not names(run.path)
 
 
-def test_the_account_of_a_failure_spares_whatever_stands_there(tmp_path: Path) -> None:
-    """A run, finished or not, and what is not one of ours; a folder that cannot be made is an OutputError."""
+def test_a_failure_record_overwrites_no_existing_file(tmp_path: Path) -> None:
+    """It replaces neither a run nor foreign files; a folder that cannot be created is an OutputError."""
     run = RunFolder(tmp_path / "trip")
     finish(run)
     before = {name: (run.path / name).read_bytes() for name in names(run.path) if (run.path / name).is_file()}
@@ -215,8 +215,8 @@ def test_the_account_of_a_failure_spares_whatever_stands_there(tmp_path: Path) -
     assert names(tmp_path / "mine") == {"notes.txt"}
 
 
-def test_a_capture_that_was_moved_is_continued(tmp_path: Path) -> None:
-    """Where the inputs lay is told, but what counts is what they hold."""
+def test_a_moved_capture_can_be_resumed(tmp_path: Path) -> None:
+    """The inputs' paths are recorded, but only their contents are compared."""
     run = RunFolder(tmp_path / "trip")
     moved = {**REQUEST, "inputs": [{**REQUEST["inputs"][0], "path": "/old/movie.mp4"}]}  # type: ignore[dict-item]
     with opened_run(run, REQUEST, "new"):
@@ -224,7 +224,7 @@ def test_a_capture_that_was_moved_is_continued(tmp_path: Path) -> None:
     assert check_run(run, REQUEST, "resume") == "finished"
 
 
-def test_overwrite_removes_what_a_run_made_and_nothing_else(tmp_path: Path) -> None:
+def test_overwrite_removes_only_files_of_the_run(tmp_path: Path) -> None:
     """Foreign files in the folder of a run stay."""
     run = RunFolder(tmp_path / "trip")
     finish(run)
@@ -236,7 +236,7 @@ def test_overwrite_removes_what_a_run_made_and_nothing_else(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("mode", ["new", "resume", "overwrite"])
 def test_a_foreign_folder_is_never_touched(tmp_path: Path, mode: str) -> None:
-    """A folder without a run in it is refused, whatever was asked for, even with a foreign run.json in it."""
+    """A folder without a run is refused in every mode, even with a foreign run.json in it."""
     folder = tmp_path / "trip"
     (folder / "frames").mkdir(parents=True)
     (folder / "frames" / "000000.png").write_bytes(b"holiday")
@@ -247,7 +247,7 @@ def test_a_foreign_folder_is_never_touched(tmp_path: Path, mode: str) -> None:
 
 
 def test_a_frames_folder_that_is_a_link_is_refused(tmp_path: Path) -> None:
-    """--overwrite must not follow a link out of the run's folder."""
+    """``--overwrite`` must not follow a link out of the run's folder."""
     run = RunFolder(tmp_path / "trip")
     finish(run)
     run.frames.rename(tmp_path / "album")
@@ -265,8 +265,8 @@ def test_a_failure_before_the_first_segment_leaves_nothing(tmp_path: Path) -> No
     assert not run.path.exists()
 
 
-def test_a_failure_after_a_segment_leaves_a_run_that_can_be_resumed(tmp_path: Path) -> None:
-    """Whole files stay, halves go."""
+def test_a_failure_after_a_segment_leaves_a_resumable_run(tmp_path: Path) -> None:
+    """Complete files stay and partial files are removed."""
     run = RunFolder(tmp_path / "trip")
     with pytest.raises(RuntimeError), opened_run(run, REQUEST, "new"):
         fail_with(run, segments=(0,))
@@ -276,7 +276,7 @@ def test_a_failure_after_a_segment_leaves_a_run_that_can_be_resumed(tmp_path: Pa
 
 
 def test_two_processes_cannot_work_in_one_folder(tmp_path: Path) -> None:
-    """The second is refused; the lock goes with its holder, even by SIGKILL."""
+    """The second is refused; the lock is released with its holder, even after SIGKILL."""
     run = RunFolder(tmp_path / "trip")
     program = (
         "import sys, time, pathlib; from virest.app.run_folder import *\n"
@@ -296,7 +296,7 @@ def test_two_processes_cannot_work_in_one_folder(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("taken", ["out", "out/trip"])
 def test_an_output_path_that_is_a_file_is_refused(tmp_path: Path, taken: str) -> None:
-    """A file in the way is named, and stays."""
+    """The existing file stays."""
     (tmp_path / taken).parent.mkdir(exist_ok=True)
     (tmp_path / taken).write_text("mine")
     with pytest.raises(OutputError), opened_run(RunFolder(tmp_path / "out" / "trip"), REQUEST, "overwrite"):

@@ -1,4 +1,4 @@
-"""PNG files: what another decoder reads is what was written, bit by bit."""
+"""PNG files: another decoder reads exactly what was written."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ def _pictures() -> dict[str, NDArray[np.uint8]]:
 
 @pytest.mark.parametrize("name", _pictures())
 def test_another_decoder_reads_back_every_pixel(name: str) -> None:
-    """OpenCV's decoder returns the picture exactly, whatever its size, content and place in memory."""
+    """OpenCV's decoder returns the picture exactly, for any size, content and memory layout."""
     picture = _pictures()[name]
     read = cv2.imdecode(np.frombuffer(png_bytes(picture), np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(read[..., ::-1], picture)
 
 
 def test_a_grey_picture_stays_grey() -> None:
-    """One channel in, one channel out."""
+    """One channel is written and one is read."""
     grey = np.random.default_rng(6).integers(0, 256, (29, 41), np.uint8)
     read = cv2.imdecode(np.frombuffer(png_bytes(grey), np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(read, grey)
 
 
 def test_every_chunk_carries_its_checksum() -> None:
-    """Length, kind, data, CRC-32 of kind and data: zlib's, chunk by chunk, to the end of the file."""
+    """Each chunk has the length, type, data and zlib's CRC-32 of type and data, up to the end of the file."""
     data = png_bytes(_pictures()["ramp"])
     assert data.startswith(SIGNATURE)
     kinds, place = [], len(SIGNATURE)
@@ -60,26 +60,26 @@ def test_every_chunk_carries_its_checksum() -> None:
 
 
 def test_the_same_picture_gives_the_same_bytes() -> None:
-    """Nothing but the pixels decides: no time, no place in memory."""
+    """The bytes depend only on the pixels, not on time or memory layout."""
     picture = _pictures()["noise"]
     elsewhere = np.ascontiguousarray(picture[::-1])[::-1]
     assert png_bytes(picture) == png_bytes(picture) == png_bytes(elsewhere)
 
 
 def test_rows_are_filtered_modulo_256() -> None:
-    """PNG's filter "up": 3 − 250 is 9, the first row stays, and each row begins with the filter's number, 2."""
+    """PNG's filter "up": 3 − 250 is 9, the first row is unchanged, and each row begins with the filter type, 2."""
     rows = np.array([[250, 7], [3, 7], [3, 200]], np.uint8)
     np.testing.assert_array_equal(less_row_above(rows), [[2, 250, 7], [2, 9, 0], [2, 0, 193]])
 
 
 @pytest.mark.parametrize("shape", [(0, 5, 3), (5, 0, 3), (4, 4, 2), (4,), (2, 2, 2, 3)])
-def test_what_is_no_picture_is_refused(shape: tuple[int, ...]) -> None:
-    """Pictures without pixels and with other channels than PNG's."""
+def test_an_array_that_is_not_a_picture_is_rejected(shape: tuple[int, ...]) -> None:
+    """Arrays without pixels or with a channel count that PNG does not have."""
     with pytest.raises(ValueError, match="not an 8-bit picture"):
         png_bytes(np.zeros(shape, np.uint8))
 
 
 def test_sixteen_bits_are_refused() -> None:
-    """They would be written as twice as many pixels."""
+    """They would be written as twice the number of pixels."""
     with pytest.raises(ValueError, match="uint16"):
         png_bytes(np.zeros((4, 4, 3), np.uint16))

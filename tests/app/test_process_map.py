@@ -1,4 +1,4 @@
-"""Calls shared out among processes."""
+"""Calls distributed over processes."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from virest.inference.parallel import begun, one_by_one
 
 
 def die_elsewhere(parent: int, value: float) -> float:
-    """End the process at once, but for the one that asks."""
+    """End the process at once, unless it is the calling one."""
     if os.getpid() != parent:
         os.kill(os.getpid(), signal.SIGKILL)
     return 2 * value
 
 
-def test_results_come_in_the_order_of_the_calls_and_a_worker_s_death_costs_none() -> None:
-    """Two processes give what one gives; the calls of a worker that dies are made here, and so are all later ones."""
+def test_results_keep_the_order_of_the_calls_and_survive_a_dying_worker() -> None:
+    """Two processes give what one gives. The calls of a dying worker, and all later calls, run in this process."""
     calls = [(float(k), 3.0) for k in range(7)]
     with process_map(2) as each:
         told: list[int] = []
@@ -32,8 +32,8 @@ def test_results_come_in_the_order_of_the_calls_and_a_worker_s_death_costs_none(
         assert each(os.getpid, [(), ()]) == [os.getpid()] * 2
 
 
-def test_a_call_is_begun_beside_and_a_worker_s_death_does_not_cost_it() -> None:
-    """Its result is there when asked for; if its worker dies, or has died, it is made here."""
+def test_a_call_started_in_the_background_survives_a_dying_worker() -> None:
+    """If its worker dies or has died, the call runs in this process."""
     with process_map(2) as each:
         elsewhere, doomed = begun(each, os.getpid), begun(each, die_elsewhere, os.getpid(), 1.5)
         assert elsewhere() != os.getpid()
@@ -41,8 +41,8 @@ def test_a_call_is_begun_beside_and_a_worker_s_death_does_not_cost_it() -> None:
         assert begun(each, os.getpid)() == os.getpid()
 
 
-def test_without_processes_nothing_is_begun_before_its_result_is_wanted() -> None:
-    """A call that nobody asks after costs nothing."""
+def test_without_processes_a_call_runs_when_its_result_is_requested() -> None:
+    """A call whose result is never requested does not run."""
     made = []
     with process_map(1) as each:
         first, _ = begun(each, made.append, 1), begun(each, made.append, 2)
@@ -51,14 +51,14 @@ def test_without_processes_nothing_is_begun_before_its_result_is_wanted() -> Non
     assert made == [1]
 
 
-def test_one_job_is_done_here() -> None:
+def test_one_job_runs_in_this_process() -> None:
     """Without a second core no process is started."""
     with process_map(1) as each:
         assert each(os.getpid, [(), ()]) == [os.getpid()] * 2
 
 
 def test_an_interruption_waits_for_no_worker() -> None:
-    """Ctrl-C in the middle of long calls ends the processes that make them."""
+    """Ctrl-C during long calls ends the worker processes."""
     begun = []
 
     def interrupted() -> None:

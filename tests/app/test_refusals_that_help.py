@@ -1,4 +1,4 @@
-"""Refusals that tell how to go on, and results that are written although they are rough."""
+"""Errors that state how to continue, and rough results that are still written."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from virest.restoration.settings import RestorationSettings
 
 
 def fit_of(recording) -> TrackFit:
-    """An offset fitted to a recording's points."""
+    """An offset fitted to the tracked points of a recording."""
     return fit_tracks(recording.imu, recording.table(), recording.profile, [TIME_OFFSET])
 
 
 def calibrated(value: CalibratedValue) -> GeometryCalibration:
-    """A calibration of which only one value matters."""
+    """A calibration in which only one value matters."""
     recording = recorded(Setup(seed=5, frames=14))
     fit = fit_of(recording)
     return GeometryCalibration(recording.profile, (value,), (), "none", 0.1, 0.1, 0.2, 0.9, 0.0, 13, 500, (), fit)
 
 
 @pytest.mark.parametrize(("std_s", "rough"), [(0.0032, True), (1.5 * ROUGH_OFFSET_S, False)])
-def test_an_offset_known_roughly_is_written_and_says_so(std_s: float, rough: bool) -> None:
-    """3.2 ms is no reason to write nothing; a deviation of half a frame is."""
+def test_a_roughly_known_offset_is_written_with_a_note(std_s: float, rough: bool) -> None:
+    """A deviation of 3.2 ms is accepted with a note; one of half a frame is an error."""
     fit = fit_of(recorded(Setup(seed=5, frames=14)))
     value = roughly_known(CalibratedValue("time_offset_s", None, 0.45, std_s, determined=False), fit)
     assert value.rough is rough
@@ -49,14 +49,14 @@ def test_an_offset_known_roughly_is_written_and_says_so(std_s: float, rough: boo
             _require_offset(calibrated(value))
 
 
-def test_an_offset_that_one_moment_tells_is_not_even_roughly_known() -> None:
-    """Nothing bears a single block of time out."""
+def test_an_offset_from_one_time_block_is_not_roughly_known() -> None:
+    """No second time block confirms the value."""
     fit = replace(fit_of(recorded(Setup(seed=5, frames=14))), stretches=np.array([1.1]))
     assert not roughly_known(CalibratedValue("time_offset_s", None, 0.45, 0.0032, determined=False), fit).rough
 
 
-def test_a_curve_that_exists_is_replaced_only_where_that_is_asked_for(tmp_path: Path) -> None:
-    """The refusal comes before any work and names the option."""
+def test_an_existing_curve_is_replaced_only_on_request(tmp_path: Path) -> None:
+    """The error comes before any work and names the option."""
     out = tmp_path / "curve.yaml"
     out.write_text("mine")
     with pytest.raises(OutputError) as refused:
@@ -65,8 +65,8 @@ def test_a_curve_that_exists_is_replaced_only_where_that_is_asked_for(tmp_path: 
     assert out.read_text() == "mine"
 
 
-def test_a_movie_that_follows_no_gyroscope_has_to_be_recorded_again() -> None:
-    """Of a stabilised movie no calibration makes more: the advice does not lead to a command that refuses it."""
+def test_a_stabilised_movie_must_be_recorded_again() -> None:
+    """The advice is to switch stabilisation off. It does not name a calibration, which would be refused."""
     unknown = replace(recorded(Setup(seed=3, frames=6)).profile, time_offset_s=None)
     plan = RestorationPlan(unknown, RestorationSettings())
     assert "virest calibrate" in _advice(plan)
@@ -79,7 +79,7 @@ def test_a_movie_that_follows_no_gyroscope_has_to_be_recorded_again() -> None:
 
 
 def test_a_calibration_that_left_values_open_is_not_advised_again() -> None:
-    """Its profile holds its estimates; the same command would find as little in the same capture."""
+    """A profile that holds a calibration's estimates gets no advice to calibrate the same capture again."""
     profile = replace(recorded(Setup(seed=3, frames=6)).profile, time_offset_s=None, intrinsics=None)
     assert "run virest calibrate" in _advice(RestorationPlan(profile, RestorationSettings()))
     offset = CalibratedValue("time_offset_s", None, 0.43, 0.0028, determined=True)
@@ -91,7 +91,7 @@ def test_a_calibration_that_left_values_open_is_not_advised_again() -> None:
 
 
 def test_an_empty_folder_is_called_empty(tmp_path: Path) -> None:
-    """And of another one the error says what it holds instead."""
+    """For another folder the error lists what it holds."""
     with pytest.raises(CaptureError, match="; it is empty"):
         choose_reader(tmp_path)
     (tmp_path / "notes.txt").touch()

@@ -1,4 +1,4 @@
-"""``virest report``: its page from a real run, what it says of broken ones, and the page in a real browser."""
+"""``virest report``: the page of a real run, errors for broken runs, and the page in a real browser."""
 
 import base64
 import json
@@ -17,7 +17,7 @@ from virest.app.simulate import simulate_command
 from virest.capture.video import probe_movie, read_frames
 
 HOLE_NS = (245_000_000, 450_000_000)
-"""From the first frame."""
+"""Time from the first frame."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 PHONE, DESK = {"width": 390, "height": 844}, {"width": 1280, "height": 900}
 HOSTILE = "<img src=x onerror=alert(1)> \"'><script>alert(2)</script> ../../\u202egnp"
@@ -42,7 +42,7 @@ DIAGNOSIS = {
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A lively capture with a hole in its gyroscope data in ``captures/tiny``, and the run made from it in ``out``."""
+    """A high-motion capture with a gap in its gyroscope data in ``captures/tiny``, and its run in ``out``."""
     place = tmp_path_factory.mktemp("report")
     capture = place / "captures" / "tiny"
     simulate_command(capture, width=240, height=180, frames=24, exposure_ms=[14.0], rate_rad_s=2.5, seed=5)
@@ -57,14 +57,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def made(finished: Path, tmp_path: Path) -> Path:
-    """``out/tiny`` of its own for each test; the capture stays where the run found it."""
+    """A copy of ``out/tiny`` for each test; the capture stays where the run found it."""
     shutil.copytree(finished / "out", tmp_path / "out")
     return tmp_path / "out" / "tiny"
 
 
 @pytest.fixture
 def report(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """``report(folder, …)`` gives exit code, standard output and standard error."""
+    """``report(folder, …)`` returns exit code, standard output and standard error."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
         capsys.readouterr()
@@ -81,14 +81,14 @@ def edit(path: Path, **changes: Any) -> None:
 
 
 def pictures_of(page: Path) -> list[np.ndarray]:
-    """The pictures inside a page, RGB, in its order."""
+    """The pictures in a page, RGB, in their order."""
     coded = re.findall(r'<img src="data:image/webp;base64,([^"]*)"', page.read_text())
     data = (np.frombuffer(base64.b64decode(text), np.uint8) for text in coded)
     return [cv2.imdecode(item, cv2.IMREAD_COLOR_RGB).astype(int) for item in data]
 
 
 def diagnose_into(folder: Path) -> None:
-    """Lay a diagnosis with a figure into a folder."""
+    """Write a diagnosis with a figure into a folder."""
     (folder / "figures").mkdir(parents=True)
     (folder / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
     (folder / "extended.yaml").write_text("# <b>profile</b>\nvirest_profile: 1\n")
@@ -97,11 +97,11 @@ def diagnose_into(folder: Path) -> None:
     cv2.imwrite(str(folder.parent.parent / "secret.png"), figure)
 
 
-# ── what stands in the page ──────────────────────────────────────────────────────────────────────────────────────
+# ── contents of the page ─────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_the_page_shows_the_movies_frames_and_the_restored_ones(report, made, finished):
-    """Before is what the movie holds, after what the run wrote; the JSON says which frames."""
+def test_the_page_shows_recorded_and_restored_frames(report, made, finished):
+    """The page pairs frames of the movie with frames of the run; the JSON names the frames."""
     code, out, err = report(made, "--json", "--frames", 2)
     facts = json.loads(out)
     (capture,) = facts["captures"]
@@ -122,8 +122,8 @@ def test_the_page_shows_the_movies_frames_and_the_restored_ones(report, made, fi
         assert np.abs(pictures[2 * k + 1] - restored).mean() < 0.4 * distance
 
 
-def test_frames_left_out_stand_with_their_reason_and_range(report, made):
-    """The hole in the gyroscope's data is in the table with the frames that fell into it."""
+def test_skipped_frames_are_listed_with_reason_and_range(report, made):
+    """The table lists the gap in the gyroscope data with the frames inside it."""
     assert report(made)[0] == 0
     lines = [json.loads(line) for line in (made / "parameters.jsonl").read_text().splitlines()]
     skipped = [line["frame"] for line in lines if line["status"] == "skipped"]
@@ -134,7 +134,7 @@ def test_frames_left_out_stand_with_their_reason_and_range(report, made):
 
 
 def test_an_existing_page_is_refused_before_any_work_and_replaced_on_request(report, made):
-    """Exit 8 without ``--overwrite``, the old page untouched; a folder in its place is refused in any case."""
+    """Exit 8 without ``--overwrite``, and the old page stays; a folder at the page's path is always refused."""
     (made / "report.html").write_text("old")
     code, out, err = report(made)
     assert (code, out) == (8, "")
@@ -146,8 +146,11 @@ def test_an_existing_page_is_refused_before_any_work_and_replaced_on_request(rep
     assert not list(made.glob("*.part"))
 
 
-def test_a_movie_that_is_gone_or_another_is_said_and_only_restored_frames_are_shown(report, made, finished, tmp_path):
-    """``--capture`` tells where the movie is now, or the folder that holds the captures."""
+def test_a_missing_or_different_movie_is_noted(report, made, finished, tmp_path):
+    """Only restored frames are shown then.
+
+    ``--capture`` names the movie's new folder, or the folder that holds the captures.
+    """
     edit(
         made / "run.json",
         profile_source="the capture's metadata",
@@ -176,8 +179,8 @@ def test_a_movie_that_is_gone_or_another_is_said_and_only_restored_frames_are_sh
     assert "is not the movie" in json.loads(out)["captures"][0]["notes"][0]
 
 
-def test_a_diagnosis_stands_beside_its_run_or_alone(report, made, tmp_path):
-    """Verdict, causes and own figures; no file that a diagnosis.json names elsewhere."""
+def test_a_diagnosis_is_shown_with_its_run_or_alone(report, made, tmp_path):
+    """The page shows verdict, causes and figures of the diagnosis, and no file outside its folder."""
     diagnose_into(made)
     code, out, _ = report(made, "--json", "--frames", 1)
     assert code == 0
@@ -195,7 +198,7 @@ def test_a_diagnosis_stands_beside_its_run_or_alone(report, made, tmp_path):
 
 
 def test_several_captures_make_one_page_with_a_section_each(report, made):
-    """OUT itself: a list with links; a capture that cannot be read is named, and the rest is done (exit 9)."""
+    """For OUT itself the page has a list with links; an unreadable capture is named and the rest is shown (exit 9)."""
     shutil.copytree(made, made.parent / "other")
     edit(made.parent / "other" / "run.json", capture="other")
     assert report(made.parent)[0] == 0
@@ -210,7 +213,7 @@ def test_several_captures_make_one_page_with_a_section_each(report, made):
     assert "other/run.json" in err
 
 
-# ── what cannot be used ──────────────────────────────────────────────────────────────────────────────────────────
+# ── unusable folders ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def break_by(name: str, folder: Path) -> None:
@@ -249,8 +252,8 @@ def break_by(name: str, folder: Path) -> None:
     ["no run.json", "unfinished", "another JSON", "no object", "cut", "no UTF-8", "words for counts", "deep",
      "a folder", "no parameters", "noise", "diagnosis of nothing"],
 )  # fmt: skip
-def test_a_folder_that_cannot_be_used_is_one_line_and_exit_4(report, made, name):
-    """And no page is left."""
+def test_an_unusable_folder_gives_one_line_and_exit_4(report, made, name):
+    """No page is written."""
     break_by(name, made)
     code, out, err = report(made)
     assert (code, out) == (4, "")
@@ -259,8 +262,8 @@ def test_a_folder_that_cannot_be_used_is_one_line_and_exit_4(report, made, name)
     assert not (made / "report.html").exists()
 
 
-def test_a_cut_log_gives_the_page_of_what_can_be_read_and_says_so(report, made):
-    """The last line is half: the page has the others, and a note."""
+def test_a_truncated_log_gives_a_page_with_a_note(report, made):
+    """The last line is incomplete: the page shows the other frames and a note."""
     path = made / "parameters.jsonl"
     path.write_bytes(path.read_bytes()[:-200])
     code, _, err = report(made)
@@ -269,8 +272,8 @@ def test_a_cut_log_gives_the_page_of_what_can_be_read_and_says_so(report, made):
     assert "23 of 24 frames; line 24" in (made / "report.html").read_text()
 
 
-def test_numbers_beyond_measure_do_not_break_the_page(report, made):
-    """Infinite, huge and missing values are passed over; a line that makes no sense at all is left out."""
+def test_extreme_numbers_do_not_break_the_page(report, made):
+    """Infinite, huge and missing values are ignored; a line with invalid fields is left out."""
     path = made / "parameters.jsonl"
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     lines[0]["blur"]["tiles"][0].update(length_px=1e308, angle_rad=float("nan"))
@@ -290,16 +293,16 @@ def test_numbers_beyond_measure_do_not_break_the_page(report, made):
     assert report(made, "--overwrite")[0] == 4
 
 
-def test_a_folder_that_is_not_there_is_exit_4_and_no_argument_exit_2(report, tmp_path):
-    """An empty folder holds nothing to report either."""
+def test_a_missing_folder_exits_with_4_and_a_usage_error_with_2(report, tmp_path):
+    """An empty folder has nothing to report either."""
     assert report(tmp_path / "nowhere")[0] == 4
     assert report(tmp_path)[0] == 4
     assert report()[0] == 2
     assert report(tmp_path, "--frames", 0)[0] == 2
 
 
-def test_a_picture_that_is_gone_or_broken_leaves_its_place_empty(report, made):
-    """The other pictures are shown, and the words say which is missing."""
+def test_a_broken_picture_is_left_out(report, made):
+    """The other pictures are shown, and a message names the problem."""
     for picture in (made / "frames").iterdir():
         picture.write_bytes(b"no picture")
     code, out, err = report(made, "--json", "--frames", 2)
@@ -314,7 +317,7 @@ def test_a_picture_that_is_gone_or_broken_leaves_its_place_empty(report, made):
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """A headless Chromium of this machine."""
+    """A headless Chromium installed on this machine."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         pytest.skip(f"none of {', '.join(BROWSERS)} is installed")
@@ -327,7 +330,7 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture
 def opened(chromium: Any) -> Iterator[Callable[..., Any]]:
-    """``opened(file, …)`` shows a page and notes whatever leaves it or fails in it, in ``page.complaints``."""
+    """``opened(file, …)`` opens a page and collects its requests, errors and dialogs in ``page.complaints``."""
     contexts = []
 
     def show(file: Path, **settings: Any) -> Any:
@@ -349,13 +352,13 @@ def opened(chromium: Any) -> Iterator[Callable[..., Any]]:
 
 
 def seen(element: Any) -> np.ndarray:
-    """What an element looks like, RGB."""
+    """A screenshot of an element, RGB."""
     data = np.frombuffer(element.screenshot(), np.uint8)
     return cv2.imdecode(data, cv2.IMREAD_COLOR_RGB).astype(int)
 
 
 def test_the_slider_works_by_keyboard_and_the_chooser_by_click(report, made, opened):
-    """Home shows the restored picture, End the recorded one; another frame is chosen; nothing is asked of the net."""
+    """Home shows the restored frame, End the recorded one; another frame can be selected; the page requests nothing."""
     assert report(made, "--frames", 3)[0] == 0
     page = opened(made / "report.html")
     picture, slider = page.locator("[data-compare]:visible"), page.locator("[data-cut]:visible")
@@ -396,7 +399,7 @@ def test_the_slider_works_by_keyboard_and_the_chooser_by_click(report, made, ope
 
 
 def test_arrows_are_drawn_over_the_recorded_picture_until_switched_off(report, made, opened):
-    """Yellow strokes where the page says so; the switch takes them away."""
+    """Yellow strokes appear over the frame and disappear with the switch."""
     assert report(made, "--frames", 1)[0] == 0
     page = opened(made / "report.html")
     page.locator("[data-cut]").fill("100")
@@ -408,8 +411,8 @@ def test_arrows_are_drawn_over_the_recorded_picture_until_switched_off(report, m
 
 
 @pytest.mark.parametrize("viewport", [PHONE, DESK], ids=["phone", "desk"])
-def test_nothing_overflows_on_a_phone_or_a_desk(report, made, opened, viewport):
-    """With hostile names and endless words: text as text, no dialog, no request, no sideways scrolling."""
+def test_nothing_overflows_on_a_phone_or_a_desktop(report, made, opened, viewport):
+    """Hostile names and very long words stay text: no dialog, no request, no horizontal scrolling."""
     diagnose_into(made)
     edit(made / "run.json", capture=HOSTILE, verdict=HOSTILE, warnings=[HOSTILE, "endless" * 80], command="x" * 900)
     assert report(made)[0] == 0
@@ -425,8 +428,8 @@ def test_nothing_overflows_on_a_phone_or_a_desk(report, made, opened, viewport):
     assert seen(page).std() > 10
 
 
-def test_without_javascript_every_picture_stands_in_the_page(report, made, opened):
-    """Recorded and restored one beside or below the other, no control that does nothing."""
+def test_without_javascript_every_picture_is_shown(report, made, opened):
+    """Recorded and restored frames are shown below each other, without controls that have no effect."""
     assert report(made, "--frames", 2)[0] == 0
     page = opened(made / "report.html", viewport=PHONE, java_script_enabled=False)
     boxes = [image.bounding_box() for image in page.locator("figure img").all()]
@@ -437,8 +440,8 @@ def test_without_javascript_every_picture_stands_in_the_page(report, made, opene
     assert page.locator("input:visible, button:visible").count() == 0
 
 
-def test_dark_and_print_have_their_own_looks(report, made, opened):
-    """Dark where the reader's system is; on paper every frame with both pictures, and no controls."""
+def test_dark_mode_and_print_have_their_own_style(report, made, opened):
+    """The page is dark in dark mode; on paper every frame has both pictures and no controls."""
     assert report(made, "--frames", 2)[0] == 0
     light, dark = (opened(made / "report.html", color_scheme=scheme) for scheme in ("light", "dark"))
     assert seen(light)[:20].mean() > 200

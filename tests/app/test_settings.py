@@ -1,4 +1,4 @@
-"""Settings: preset, then file, then options; strict."""
+"""Settings from preset, file and options, in this order, with strict checks."""
 
 import dataclasses
 from pathlib import Path
@@ -21,7 +21,7 @@ def settings_file(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_presets_file_says_what_the_preset_says(preset: str) -> None:
+def test_a_preset_file_equals_its_preset(preset: str) -> None:
     """configs/<preset>.yaml is the preset written out, key by key."""
     assert compose_settings(CONFIGS / f"{preset}.yaml") == PRESETS[preset]
     keys = {line.split(":")[0] for line in (CONFIGS / f"{preset}.yaml").read_text().splitlines() if line[0].isalpha()}
@@ -38,14 +38,14 @@ def test_every_file_in_configs_can_be_read(path: Path) -> None:
 
 
 def test_options_override_the_file_which_overrides_the_preset(tmp_path: Path) -> None:
-    """Each layer changes only what it names."""
+    """Each layer changes only the keys it names."""
     path = settings_file(tmp_path, "preset: fast\ndeblur: wiener\niterations: 9\n")
     settings = compose_settings(path, deblur="inverse", shutter=None)
     assert settings == dataclasses.replace(PRESETS["fast"], deblur="inverse", iterations=9)
 
 
 def test_the_preset_option_replaces_the_files_preset_and_keeps_its_keys(tmp_path: Path) -> None:
-    """--preset decides where the missing keys come from."""
+    """``--preset`` supplies the keys that the file does not set."""
     path = settings_file(tmp_path, "preset: fast\nstrength: 2.0\n")
     assert compose_settings(path, preset="best") == dataclasses.replace(PRESETS["best"], strength=2.0)
 
@@ -66,8 +66,8 @@ def test_the_preset_option_replaces_the_files_preset_and_keeps_its_keys(tmp_path
         ("", "no keys"),
     ],
 )
-def test_a_bad_settings_file_is_named_with_its_key(tmp_path: Path, text: str, says: str) -> None:
-    """One line: the file, the key, and what would be right."""
+def test_the_error_for_an_invalid_settings_file_names_file_and_key(tmp_path: Path, text: str, says: str) -> None:
+    """One line names the file, the key and what is expected."""
     with pytest.raises(SettingsError, match=r"mine\.yaml") as caught:
         compose_settings(settings_file(tmp_path, text))
     assert says in str(caught.value)
@@ -75,13 +75,13 @@ def test_a_bad_settings_file_is_named_with_its_key(tmp_path: Path, text: str, sa
 
 
 def test_a_missing_settings_file_is_a_settings_error(tmp_path: Path) -> None:
-    """Exit code 3."""
+    """It names the missing file."""
     with pytest.raises(SettingsError, match="no such file"):
         compose_settings(tmp_path / "none.yaml")
 
 
 def test_every_setting_can_be_written_in_a_file() -> None:
-    """The file's keys are the record's fields."""
+    """The file's keys are the fields of the settings record."""
     assert settings_model().model_fields.keys() - {"virest_settings"} == {
         field.name for field in dataclasses.fields(RestorationSettings)
     }

@@ -1,4 +1,4 @@
-"""``virest simulate`` and what becomes of its captures."""
+"""``virest simulate`` and the use of its captures."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ SMALL = ("--width", 160, "--height", 120, "--frames", 3)
 
 
 def test_a_simulated_capture_can_be_inspected_and_processed(virest: Virest, tmp_path: Path) -> None:
-    """Simulate, inspect, process: each takes what the one before wrote."""
+    """``inspect`` and ``process`` accept what ``simulate`` wrote."""
     made = virest("simulate", "trip", *SMALL, "--effect", "time_offset=0.004", "--json", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
     facts = json.loads(made.stdout)
@@ -26,8 +26,8 @@ def test_a_simulated_capture_can_be_inspected_and_processed(virest: Virest, tmp_
     assert [json.loads(line)["frame"] for line in done.stdout.splitlines()] == [0, 1, 2]
 
 
-def test_a_still_bracket_can_be_asked_for(virest: Virest, tmp_path: Path) -> None:
-    """``--auto-exposure 4:2 --rate 0``: two exposures 4 EV apart, and the summary names their range."""
+def test_a_still_bracket_can_be_simulated(virest: Virest, tmp_path: Path) -> None:
+    """``--auto-exposure 4:2 --rate 0`` gives two exposures 4 EV apart, and the summary states their range."""
     made = virest("simulate", "trip", *SMALL, "--auto-exposure", "4:2", "--rate", 0, "--json", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
     facts = json.loads(made.stdout)
@@ -52,7 +52,9 @@ def test_a_still_bracket_can_be_asked_for(virest: Virest, tmp_path: Path) -> Non
         (("--sharpen", "1,2,3"), 2, "--sharpen"),
     ],
 )
-def test_a_wrong_wish_is_one_line(virest: Virest, tmp_path: Path, arguments: tuple[object, ...], code: int, says: str):
+def test_an_invalid_option_gives_one_line(
+    virest: Virest, tmp_path: Path, arguments: tuple[object, ...], code: int, says: str
+):
     """Nothing is written."""
     result = virest("simulate", "trip", *SMALL, *arguments, cwd=tmp_path)
     assert result.returncode == code
@@ -61,8 +63,8 @@ def test_a_wrong_wish_is_one_line(virest: Virest, tmp_path: Path, arguments: tup
     assert not (tmp_path / "trip").exists()
 
 
-def test_a_folder_that_is_no_simulated_capture_is_kept(virest: Virest, tmp_path: Path) -> None:
-    """Exit 8, even with --overwrite."""
+def test_a_folder_that_is_not_a_simulated_capture_is_kept(virest: Virest, tmp_path: Path) -> None:
+    """Exit 8, even with ``--overwrite``."""
     (tmp_path / "trip").mkdir()
     (tmp_path / "trip/holiday.jpg").write_text("mine")
     for options in ((), ("--overwrite",)):
@@ -70,8 +72,8 @@ def test_a_folder_that_is_no_simulated_capture_is_kept(virest: Virest, tmp_path:
     assert [path.name for path in (tmp_path / "trip").iterdir()] == ["holiday.jpg"]
 
 
-def test_the_sample_captures_are_small_and_whole() -> None:
-    """sample_data/ holds what `make sample` writes, together under 12 MB."""
+def test_the_sample_captures_are_small_and_complete() -> None:
+    """sample_data/ holds the captures of ``make sample``, less than 12 MB in total."""
     folder = Path(__file__).resolve().parents[2] / "sample_data"
     files = [path for path in folder.rglob("*") if path.is_file()]
     assert {path.parent.name for path in folder.glob("*/movie.mp4")} == set(sample.SAMPLES)
@@ -81,8 +83,8 @@ def test_the_sample_captures_are_small_and_whole() -> None:
         assert {path.name for path in (folder / name / "truth/frames").iterdir()} == kept
 
 
-def test_a_phone_can_be_asked_for_and_changed(virest: Virest, tmp_path: Path) -> None:
-    """``--isp phone`` with strengths of its own beside it; the summary names all that is on."""
+def test_a_phones_processing_can_be_simulated_and_changed(virest: Virest, tmp_path: Path) -> None:
+    """``--isp phone`` can be combined with individual strengths; the summary names every active step."""
     arguments = ("--isp", "phone", "--sharpen", "1.5,2", "--denoise", 0, "--offset-ms", -3)
     made = virest("simulate", "trip", *SMALL, *arguments, "--json", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
@@ -94,7 +96,7 @@ def test_a_phone_can_be_asked_for_and_changed(virest: Virest, tmp_path: Path) ->
 
 
 def test_the_help_groups_the_phones_options(virest: Virest, tmp_path: Path) -> None:
-    """They stand under a title of their own, behind the others."""
+    """They have their own heading below the other options."""
     text = virest("simulate", "--help", cwd=tmp_path).stdout
     usual, phones = text.partition("\nOptions:")[2].split("phone's own processing")
     assert "--seed" in usual

@@ -1,4 +1,4 @@
-"""`virest preview`, `virest doctor`, `virest profile`: one picture, one check, one file."""
+"""``virest preview``, ``virest doctor`` and ``virest profile``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_preview_shows_the_most_blurred_frame(swing: Path, virest_here, tmp_path: Path) -> None:
-    """One picture of three panels; another frame by number; an existing picture stays."""
+    """The picture has three panels; ``--frame`` selects another frame; an existing picture is kept."""
     done = virest_here("preview", swing / "movie.mp4", "--json", "--preset", "fast")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
@@ -34,8 +34,8 @@ def test_a_preview_shows_the_most_blurred_frame(swing: Path, virest_here, tmp_pa
     assert "--overwrite" in again.stderr
 
 
-def test_the_doctor_says_what_is_here(virest_here, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything needed is here; what is missing is named and fails."""
+def test_the_doctor_reports_the_installation(virest_here, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All required packages are installed; a missing one is named and gives exit code 1."""
     done = virest_here("doctor", "--json")
     assert done.returncode == 0, done.stdout
     facts = json.loads(done.stdout)
@@ -49,8 +49,8 @@ def test_the_doctor_says_what_is_here(virest_here, monkeypatch: pytest.MonkeyPat
     assert text.endswith("missing: no-such-package")
 
 
-def test_the_doctor_says_who_transforms_without_ipp(virest) -> None:
-    """Where OpenCV is told to do without IPP, the other library transforms, and a note says what that costs."""
+def test_the_doctor_names_the_transforms_used_without_ipp(virest) -> None:
+    """If OpenCV may not use IPP, SciPy computes the transforms, and a note says so."""
     facts = json.loads(virest("doctor", "--json", OPENCV_IPP="disabled").stdout)
     assert facts["ipp"] is None
     assert facts["transforms"] == "scipy's pocketfft"
@@ -58,7 +58,7 @@ def test_the_doctor_says_who_transforms_without_ipp(virest) -> None:
 
 
 def test_the_doctor_names_what_is_slow() -> None:
-    """Few cores, little memory, a slow core: each with its reason."""
+    """Many cores with little memory, slow transforms and missing features each have a note."""
     facts = {"cores": 8, "memory_bytes": 1.5e9, "free_bytes_here": 1e9, "fft_s": 0.05, "vector_instructions": False,
              "decoders": ["h264"], "ipp": None}  # fmt: skip
     notes = " ".join(doctor._notes(facts))
@@ -67,8 +67,8 @@ def test_the_doctor_names_what_is_slow() -> None:
     assert "one core" in doctor._notes({"cores": 1, "memory_bytes": None, "free_bytes_here": 1e12})[0]
 
 
-def test_a_profile_is_begun_from_a_capture(tiny: Path, virest_here, tmp_path: Path) -> None:
-    """What the recorder logged is in it, what it did not is null, and the program reads it."""
+def test_a_profile_is_created_from_a_capture(tiny: Path, virest_here, tmp_path: Path) -> None:
+    """Logged values are filled in, unknown ones are null, and the program can read the file."""
     (tiny / "camera.yaml").unlink()
     done = virest_here("profile", "new", tiny, "--out", "mine.yaml")
     assert done.returncode == 0, done.stderr
@@ -80,8 +80,8 @@ def test_a_profile_is_begun_from_a_capture(tiny: Path, virest_here, tmp_path: Pa
     assert "# shutter:" in (tmp_path / "mine.yaml").read_text()
 
 
-def test_a_profile_is_begun_from_a_known_phone(virest_here, tmp_path: Path) -> None:
-    """The readout time comes with its source; another mode's is not taken."""
+def test_a_profile_is_created_for_a_known_phone(virest_here, tmp_path: Path) -> None:
+    """The readout time comes with its source; a readout time of another video mode is not used."""
     done = virest_here("profile", "new", "--device", "honor view", "--size", "720x1280", "--fov-deg", "60")
     assert done.returncode == 0, done.stderr
     content = yaml.safe_load((tmp_path / "camera.yaml").read_text())
@@ -97,7 +97,7 @@ def test_a_profile_is_begun_from_a_known_phone(virest_here, tmp_path: Path) -> N
 
 
 def test_every_known_readout_is_documented_with_its_source(virest_here) -> None:
-    """The table of the documentation is that of the program; each entry has a size, a time and a source."""
+    """The documentation lists every entry of the program's table with size and source."""
     page = (ROOT / "docs" / "phones.md").read_text("utf-8")
     for entry in READOUTS:
         assert 0.001 < entry.readout_s < 0.1
@@ -107,8 +107,8 @@ def test_every_known_readout_is_documented_with_its_source(virest_here) -> None:
     assert [d["readout_s"] for d in json.loads(done.stdout)["devices"]] == [0.03, 0.03267]
 
 
-def test_help_shows_no_types_and_cuts_no_description(virest_here) -> None:
-    """Arguments bear their names, not Python's types; every command has a whole line; pages are 100 columns at most."""
+def test_help_shows_no_types_and_truncates_no_description(virest_here) -> None:
+    """Arguments have names instead of Python types, and every command's description is complete."""
     shown = virest_here("--help").stdout
     commands = shown.partition("Commands:")[2].strip().splitlines()
     assert all(line.rstrip().endswith(".") and "..." not in line for line in commands)
@@ -119,8 +119,8 @@ def test_help_shows_no_types_and_cuts_no_description(virest_here) -> None:
         assert ("-o, --out" in page) == ("--out " in page), command
 
 
-def test_a_bad_folder_is_told_in_few_lines(virest_here, tmp_path: Path) -> None:
-    """What is missing stands in one line, not in one for each file."""
+def test_a_bad_folder_is_reported_in_few_lines(virest_here, tmp_path: Path) -> None:
+    """One line lists all missing files."""
     (tmp_path / "bad").mkdir()
     (tmp_path / "bad" / "gyro_accel.csv").write_text("t,x\n")
     done = virest_here("inspect", "bad")

@@ -1,4 +1,4 @@
-"""`process --undistort`: straight lines are straight, truth is met, and what a run writes holds for its pictures."""
+"""``process --undistort``: straight lines are straight, frames match the truth, and outputs describe these frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PINCUSHION = {"model": "radtan", "k1": 0.25, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k
 
 @pytest.fixture(scope="module")
 def barrel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A board seen by a turning phone whose lens bends its lines by 10 px, 3 frames."""
+    """Three frames of a board from a turning phone whose lens bends lines by 10 px."""
     folder = tmp_path_factory.mktemp("captures") / "barrel"
     simulate_command(folder, scene="board", width=360, height=480, frames=3, exposure_ms=1.0, rate_rad_s=0.8,
                      focal_px=330.0, distortion=("radtan", BARREL), seed=5, bitrate_bits_per_px=3.0,
@@ -47,7 +47,7 @@ def lines_of(run: Path) -> list[dict[str, Any]]:
 def bend_px(board: Board) -> float:
     """Typical distance of a board's corners from straight lines through its rows and columns.
 
-    By the median: of squares that the picture's border cuts, OpenCV misplaces a corner by pixels.
+    The median is used because OpenCV misplaces corners by pixels where the border of the frame cuts a square.
     """
     off = []
     for line in (*board.points_px, *board.points_px.swapaxes(0, 1)):
@@ -64,10 +64,13 @@ def with_lens(capture: Path, place: Path, **lens: Any) -> Path:
     return place
 
 
-def test_lines_are_straight_truth_is_met_and_exports_have_no_distortion(
+def test_undistorted_frames_match_the_truth_and_export_without_distortion(
     barrel: Path, virest_here: Any, tmp_path: Path
 ) -> None:
-    """One warp straightens rows and lens: OpenCV's pinhole picture of the truth, and run.json's camera is that one."""
+    """One warp corrects rolling shutter and lens.
+
+    The frames match OpenCV's undistorted truth, and run.json describes this pinhole camera.
+    """
     for out, options in (("bent", ()), ("flat", ("--undistort",))):
         done = virest_here("process", barrel, *FAST, *options, "--out", out)
         assert done.returncode == 0, done.stderr
@@ -82,7 +85,7 @@ def test_lines_are_straight_truth_is_met_and_exports_have_no_distortion(
     for line in lines_of(run):
         assert line["done"] == ["straightened", "undistorted"]
         restored, x, y = png(run / line["output"]), *line["valid_px"][:2]
-        assert (x, y) == (0, 0), "a barrel's pinhole picture lies inside the recorded one"
+        assert (x, y) == (0, 0), "the pinhole frame of a barrel lens lies inside the recorded frame"
         truth = png(barrel / "truth" / "frames" / Path(line["output"]).name)
         flat = cv2.undistort(truth, lens, np.array(BARREL))
         assert np.median(point_distances_px(restored, flat, line["valid_px"])) < 0.1
@@ -103,10 +106,13 @@ def test_lines_are_straight_truth_is_met_and_exports_have_no_distortion(
         assert set(chain["cam0"]["distortion_coeffs"]) == {0.0}
 
 
-def test_copied_frames_masks_crops_and_films_are_of_the_same_pinhole(
+def test_copied_frames_masks_crops_and_films_share_the_pinhole_camera(
     barrel: Path, virest_here: Any, tmp_path: Path
 ) -> None:
-    """A pincushion's corners hold no data: mask, valid_px and crop say so; a film's stand-ins are undistorted too."""
+    """With a pincushion lens the corners have no data, which mask, valid_px and crop show.
+
+    Copied frames in a film are undistorted too.
+    """
     config = with_lens(barrel, tmp_path / "lens.yaml", distortion=PINCUSHION)
     assert virest_here("process", barrel, *COPY, "--out", "raw").returncode == 0
     options = ("--config", config, "--undistort", "--mask", "--crop", "--video", "all.mp4")
@@ -127,7 +133,9 @@ def test_copied_frames_masks_crops_and_films_are_of_the_same_pinhole(
         assert (line["status"], line["done"]) == ("copied", ["undistorted"])
         raw = png(tmp_path / "raw" / "barrel" / line["output"])
         flat = cv2.remap(raw, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)[y0:y1, x0:x1]
-        assert np.abs(png(run / line["output"]).astype(int) - flat).max() <= 4  # OpenCV's tables have 1/32 px
+        assert (
+            np.abs(png(run / line["output"]).astype(int) - flat).max() <= 4
+        )  # OpenCV's tables have a resolution of 1/32 px
         np.testing.assert_array_equal(png(run / "masks" / Path(line["output"]).name), 255)
     done = virest_here("process", barrel, *COPY, *options[:-1], "film.mp4", "--skip-copied", "--out", "film")
     assert done.returncode == 8  # --crop without a picture
@@ -141,8 +149,8 @@ def test_copied_frames_masks_crops_and_films_are_of_the_same_pinhole(
     assert np.abs(whole[y0 : y0 + height, x0 : x0 + width].astype(int) - part).mean() < 3
 
 
-def test_the_lens_is_part_of_what_a_run_is(barrel: Path, virest_here: Any, tmp_path: Path) -> None:
-    """--resume does not mix two geometries; a lens that cannot be inverted is refused with exit 3."""
+def test_resume_compares_the_lens_geometry(barrel: Path, virest_here: Any, tmp_path: Path) -> None:
+    """``--resume`` does not mix two geometries; a lens that cannot be inverted is refused with exit 3."""
     assert virest_here("process", barrel, *COPY, "--frames", "0").returncode == 0
     other = virest_here("process", barrel, *COPY, "--frames", "0", "--undistort", "--resume")
     assert other.returncode == 8
@@ -154,7 +162,7 @@ def test_the_lens_is_part_of_what_a_run_is(barrel: Path, virest_here: Any, tmp_p
 
 
 def test_a_lens_without_distortion_changes_no_byte(swing: Path, virest_here: Any, tmp_path: Path) -> None:
-    """The pictures are those of the run without the option, and a line says that nothing was to be done."""
+    """The frames equal those of a run without the option, and a message says that it has no effect."""
     for out, options in (("plain", ()), ("same", ("--undistort",))):
         done = virest_here("process", swing, *FAST, "--frames", "2:4", *options, "--out", out)
         assert done.returncode == 0, done.stderr

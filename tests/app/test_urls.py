@@ -1,4 +1,4 @@
-"""Captures and outputs behind an address: a real S3 server on localhost, the same bytes as on a disk."""
+"""Captures and outputs at URLs: an S3 server on localhost gives the same bytes as a disk."""
 
 import os
 import subprocess
@@ -25,7 +25,7 @@ from virest.errors import OutputError, SettingsError, VideoError
 Virest = Callable[..., "subprocess.CompletedProcess[str]"]
 FAST = ("--preset", "fast", "--jobs", 1)
 ELSEWHERE = ("folder", "movie", "profile_source", "source")
-"""Keys of run.json that name a place."""
+"""Keys of run.json that name a location."""
 REQUEST = {"version": "1", "settings": {}, "frames": "0:1:1", "profile_sha256": "ab", "inputs": []}
 
 
@@ -41,7 +41,7 @@ def server() -> Iterator[str]:
 
 @pytest.fixture
 def bucket(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Address of an empty bucket, for this process and those that it starts."""
+    """Address of an empty bucket, for this process and its child processes."""
     settings = {
         "AWS_ENDPOINT_URL": server, "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b",
         "AWS_DEFAULT_REGION": "us-east-1",
@@ -81,15 +81,15 @@ def fail_after_a_segment(run: RunFolder) -> None:
 # ── addresses ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_what_is_local_stays_a_plain_path(tmp_path: Path) -> None:
-    """So local files are read as ever; file:// is local."""
+def test_a_local_path_stays_a_plain_path(tmp_path: Path) -> None:
+    """Local files are read as before; file:// is local."""
     for text in ("trip", "/data/a:b", "s3:/odd", str(tmp_path), f"file://{tmp_path}"):
         assert type(locate(text)) is type(Path())
     assert locate(f"file://{tmp_path}/a") == tmp_path / "a"
 
 
 def test_an_address_has_the_parts_of_a_path() -> None:
-    """Names, parents and neighbours."""
+    """Name, parent and sibling work as for a path."""
     place: Any = locate("S3://trips//2022/one/movie.mp4")
     assert is_remote(place)
     assert str(place) == "s3://trips/2022/one/movie.mp4"
@@ -100,15 +100,15 @@ def test_an_address_has_the_parts_of_a_path() -> None:
 
 
 @pytest.mark.parametrize("text", ["s3://", "s3:///", "s3://trips/../other", "nosuch://a/b"])
-def test_what_is_no_address_is_refused(text: str) -> None:
-    """In one line, with what to write."""
+def test_an_invalid_address_is_refused(text: str) -> None:
+    """The error has a hint."""
     with pytest.raises(SettingsError) as caught:
         locate(text)
     assert caught.value.hint
 
 
-def test_a_missing_extra_is_one_line(tmp_path: Path) -> None:
-    """Without s3fs, an s3:// address says how to get it."""
+def test_a_missing_extra_gives_one_line(tmp_path: Path) -> None:
+    """Without s3fs, the error for an s3:// address names the extra to install."""
     program = "import sys; sys.modules['s3fs'] = None; from virest.app.cli import run; sys.exit(run(sys.argv[1:]))"
     for arguments in (["s3://trips/one"], [str(tmp_path), "--out", "s3://trips/out"]):
         command = [sys.executable, "-c", program, "process", *arguments]
@@ -122,7 +122,7 @@ def test_a_missing_extra_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_capture_is_read_the_same_from_a_bucket(bucket: str, tiny: Path) -> None:
-    """Frames, samples, notes, index and pictures."""
+    """Frames, samples, notes, index and pictures are the same."""
     upload(tiny, f"{bucket}/tiny")
     here, there = read_capture(tiny), read_capture(locate(f"{bucket}/tiny"))
     assert there.frames == here.frames
@@ -139,10 +139,10 @@ def test_a_capture_is_read_the_same_from_a_bucket(bucket: str, tiny: Path) -> No
         assert (one == other).all()
 
 
-def test_a_segment_asks_for_its_part_of_the_movie_only(
+def test_a_segment_requests_only_its_part_of_the_movie(
     bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The table of contents and the bytes of its frames; not the file."""
+    """It requests the movie's index and the bytes of its frames, less than half of the file."""
     bytes_asked: list[int] = []
     honest = location._Stream.readinto
     movie = Path(tmp_path / "movie.mp4")
@@ -160,7 +160,7 @@ def test_a_segment_asks_for_its_part_of_the_movie_only(
 
 
 def write_long_movie(path: Path) -> None:
-    """Write noise that does not compress, with a key frame every 8."""
+    """Write noise that does not compress, with a key frame every 8 frames."""
     import av
     import numpy as np
 
@@ -174,8 +174,8 @@ def write_long_movie(path: Path) -> None:
         container.mux(stream.encode())
 
 
-def test_a_store_that_gives_no_bytes_fails_no_frame(bucket: str, tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The movie may be sound: the error says so, and no frame failed for it."""
+def test_an_unreachable_store_is_not_a_decoding_error(bucket: str, tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The movie may be intact: the error names the connection and is marked as unreachable."""
     index = probe_movie(tiny / "movie.mp4")
     upload(tiny, f"{bucket}/tiny")
 
@@ -190,7 +190,7 @@ def test_a_store_that_gives_no_bytes_fails_no_frame(bucket: str, tiny: Path, mon
 
 
 def test_files_are_written_listed_fetched_and_removed(bucket: str) -> None:
-    """As in a folder; a folder without files is not there."""
+    """A bucket behaves like a folder; a folder without files does not exist."""
     folder = locate(f"{bucket}/out")
     assert not folder.exists()
     assert list(folder.iterdir()) == []
@@ -209,14 +209,14 @@ def test_files_are_written_listed_fetched_and_removed(bucket: str) -> None:
     (folder / "nothing").unlink(missing_ok=True)
 
 
-def test_a_bucket_that_is_not_there_is_an_output_error(bucket: str) -> None:
-    """What cannot be written says where."""
+def test_a_missing_bucket_is_an_output_error(bucket: str) -> None:
+    """The error names the address."""
     with pytest.raises(OutputError, match=r"s3://no-such-bucket/run\.json"):
         write_whole(locate("s3://no-such-bucket/run.json"), b"{}")
 
 
-def test_the_state_of_a_run_is_told_in_a_bucket_as_in_a_folder(bucket: str) -> None:
-    """Unfinished runs are continued, finished ones refused, run.json comes last."""
+def test_a_run_has_the_same_states_in_a_bucket_as_in_a_folder(bucket: str) -> None:
+    """Unfinished runs can be resumed, finished ones are refused, and foreign files stay."""
     run = RunFolder(locate(f"{bucket}/out/trip"))
     with pytest.raises(RuntimeError), opened_run(run, REQUEST, "new"):
         raise RuntimeError
@@ -239,8 +239,10 @@ def test_the_state_of_a_run_is_told_in_a_bucket_as_in_a_folder(bucket: str) -> N
 
 
 @pytest.mark.scenario
-def test_a_run_from_bucket_to_bucket_is_the_local_run(virest: Virest, bucket: str, tiny: Path, tmp_path: Path) -> None:
-    """Byte for byte, also after a kill and --resume; --json gives the same lines."""
+def test_a_run_from_bucket_to_bucket_equals_the_local_run(
+    virest: Virest, bucket: str, tiny: Path, tmp_path: Path
+) -> None:
+    """The files are equal byte for byte, also after a kill and ``--resume``; ``--json`` prints the same lines."""
     upload(tiny, f"{bucket}/tiny")
     assert virest("process", tiny, "--out", tmp_path / "out", *FAST).returncode == 0
     local = without_clocks(folder_files(tmp_path / "out/tiny"), *ELSEWHERE)
@@ -274,6 +276,6 @@ def test_a_run_from_bucket_to_bucket_is_the_local_run(virest: Virest, bucket: st
     assert "no such folder" in missing.stderr
 
 
-def test_nothing_of_the_machine_is_left_set() -> None:
-    """The server's address holds for one test only."""
+def test_the_server_s_address_does_not_leak() -> None:
+    """The server's address is set only during a test."""
     assert "127.0.0.1" not in os.environ.get("AWS_ENDPOINT_URL", "")

@@ -1,4 +1,4 @@
-"""Brackets with known truth: a scene of soft patches over many brightnesses, taken at several exposures."""
+"""Brackets with known truth: a scene of soft patches with a wide range of brightness, at several exposures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LINEAR = ResponseCurve("linear")
 
 
 def make_scene(width: int, height: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Light (h, w, 3) over some 5 EV: patches of many sizes, a slope, a little colour; its median is about 0.18."""
+    """Light (h, w, 3) over about 5 EV: patches of many sizes, a gradient, a little colour; its median is about 0.18."""
     log_light = np.zeros((height, width, 3), np.float32)
     for cells, size in ((7, 1.0), (23, 0.8), (60, 0.3)):
         shape = (max(cells * height // width, 2), cells)
@@ -31,7 +31,7 @@ def make_scene(width: int, height: int, rng: np.random.Generator) -> NDArray[np.
 
 def take(light: NDArray[np.float32], exposure: float, curve: ResponseCurve, rng: np.random.Generator,
          noise: float = 1.5) -> NDArray[np.uint8]:  # fmt: skip
-    """One picture, 8 bit."""
+    """One 8-bit picture."""
     levels = 255 * curve.encode(light * np.float32(exposure))
     levels = levels + noise * rng.standard_normal(levels.shape, dtype=np.float32)
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
@@ -39,7 +39,7 @@ def take(light: NDArray[np.float32], exposure: float, curve: ResponseCurve, rng:
 
 def make_bracket(curve: ResponseCurve, rng: np.random.Generator, *, width: int = 420, height: int = 310,
                  count: int = 8, span_ev: float = 6.0, noise: float = 1.5) -> list[BracketPicture]:  # fmt: skip
-    """``count`` pictures over ``span_ev``, listed as they were taken, in seconds about 1/60."""
+    """``count`` pictures over ``span_ev`` in order of capture, with exposure times around 1/60 s."""
     light = make_scene(width, height, rng)
     factors = 2.0 ** np.linspace(-span_ev / 2, span_ev / 2, count)
     return [BracketPicture(f"{i:02d}.png", take(light, f, curve, rng, noise), float(f / 60))
@@ -47,7 +47,7 @@ def make_bracket(curve: ResponseCurve, rng: np.random.Generator, *, width: int =
 
 
 def as_jpeg(levels: NDArray[np.float64], quality: int) -> NDArray[np.uint8]:
-    """A picture written as JPEG with its colours at half size, and read again."""
+    """A picture written as JPEG with half-resolution colour, and read again."""
     whole = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
     halved = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     _, data = cv2.imencode(".jpg", whole[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality, *halved])
@@ -57,9 +57,10 @@ def as_jpeg(levels: NDArray[np.float64], quality: int) -> NDArray[np.uint8]:
 def make_dark_jpegs(
     curve: ResponseCurve, rng: np.random.Generator, colour: float = 0.7, read_noise: float = 12.0
 ) -> list[BracketPicture]:
-    """Nine pictures 1 EV apart, most of them dark, as a small sensor's.
+    """Nine pictures 1 EV apart, most of them dark, as from a small sensor.
 
-    Noise of electrons cut off at black, colours mixed by a matrix that goes below zero, greys rounded and coded.
+    Electron noise is cut off at black, a matrix with negative entries mixes the colours, and greys are rounded and
+    compressed.
     """
     light = make_scene(420, 310, rng).astype(np.float64)
     patch = colour * rng.standard_normal((14, 18, 3)).astype(np.float32)
@@ -75,7 +76,7 @@ def make_dark_jpegs(
 
 
 def make_scans(curve: ResponseCurve, rng: np.random.Generator, ends: NDArray[np.float64]) -> list[BracketPicture]:
-    """Scanned film, 1 EV apart: each channel runs between its own black and white (2, 3), levels."""
+    """Scanned film, 1 EV apart: each channel runs between its own black and white level (2, 3)."""
     light = make_scene(420, 310, rng) ** 1.6
     out = []
     for i, ev in enumerate(np.linspace(-7.0, 6.0, 14)):

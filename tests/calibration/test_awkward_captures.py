@@ -1,4 +1,4 @@
-"""Calibrating captures that are unlike a phone's, or whose profile is far off."""
+"""Calibrating captures unlike a phone's, or with a profile far from the truth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OFFSET_S = 0.012
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """Simulate a capture once for all tests of this module: ``capture("name", readout_ms=0)`` gives its folder."""
+    """Simulate a capture once for all tests of this module: ``capture("name", readout_ms=0)`` returns its folder."""
     root = tmp_path_factory.mktemp("awkward")
 
     def made(name: str, *effects: str, **options: Any) -> Path:
@@ -47,13 +47,15 @@ def calibrated(folder: Path, *extra: str, config: Path | None = None) -> tuple[d
 
 
 def value_of(facts: dict[str, Any], name: str) -> dict[str, Any]:
-    """The value of a name."""
+    """The value with this name."""
     return next(dict(value) for value in facts["values"] if value["name"] == name)
 
 
 @pytest.mark.parametrize("depth", [{}, {"depth_m": 2.0}], ids=["turning", "travelling"])
-def test_equal_blur_brings_the_readout_nearer(capture: Callable[..., Path], depth: dict[str, float]) -> None:
-    """Less than half of the error is left, and four fifths of the noise."""
+def test_tracking_with_equal_blur_improves_the_readout_time(
+    capture: Callable[..., Path], depth: dict[str, float]
+) -> None:
+    """The error is less than half, and the tracking noise less than 80 %, of that without equalised blur."""
     options = {"exposure_ms": 10.0, "rate_rad_s": 1.0, "scene": "board", "seed": 54, "frames": 60, **depth}
     plan = plan_calibration(capture(f"blurred {len(depth)}", **options))
     gray = GrayReader.of(plan.capture.movie)
@@ -73,8 +75,8 @@ def test_equal_blur_brings_the_readout_nearer(capture: Callable[..., Path], dept
     assert off_s[1] < 0.5 * off_s[0]
 
 
-def test_frames_in_which_no_point_is_found_again_change_nothing(capture: Callable[..., Path]) -> None:
-    """The first tracking then stands."""
+def test_a_second_tracking_without_points_changes_nothing(capture: Callable[..., Path]) -> None:
+    """The first tracking is used."""
     plan = plan_calibration(capture("alone", seed=55))
     pairs = track_guided(plan.capture, plan.profile, GrayReader.of(plan.capture.movie), plan.frames)
     once, again = (
@@ -85,7 +87,7 @@ def test_frames_in_which_no_point_is_found_again_change_nothing(capture: Callabl
 
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_global_shutter_is_found(capture: Callable[..., Path], hidden: bool) -> None:
-    """Whether the profile states it or gives 20 ms: the readout is 0, has no direction, and the offset is right."""
+    """Starting from 0 or 20 ms of readout, the result is 0 without direction, and the offset is right."""
     folder = capture("wrong", "readout_time=0", seed=52) if hidden else capture("global", readout_ms=0.0, seed=51)
     facts, profile = calibrated(folder)
     readout, offset = value_of(facts, "readout_time_s"), value_of(facts, "time_offset_s")
@@ -110,10 +112,10 @@ def without_accelerometer(folder: Path, out: Path) -> Path:
 
 
 @pytest.mark.parametrize("seed", [72, 73])
-def test_travel_without_an_accelerometer_is_not_a_sure_gyro_bias(
+def test_translation_without_an_accelerometer_widens_the_deviations(
     capture: Callable[..., Path], tmp_path: Path, seed: int
 ) -> None:
-    """Before a wall, yaw and pitch look like travel: the deviations of axes and bias contain it."""
+    """Near a wall, yaw and pitch look like translation; the standard deviations of axes and bias account for it."""
     folder = without_accelerometer(capture(f"wall-{seed}", depth_m=1.5, seed=seed), tmp_path / "gyro-only")
     facts, profile = calibrated(folder)
     assert facts["translation"] == "direction"
@@ -134,7 +136,7 @@ def wrong_focal(folder: Path, out: Path, factor: float) -> Path:
 
 @pytest.mark.parametrize("factor", [0.5, 1.8])
 def test_a_focal_length_far_off_is_found(capture: Callable[..., Path], tmp_path: Path, factor: float) -> None:
-    """Also where the frames do not seem to follow the gyroscope until it is scaled."""
+    """Calibration works even if the frames do not seem to follow the gyroscope at the given focal length."""
     folder = capture("plain", seed=53)
     facts, _ = calibrated(folder, "focal", config=wrong_focal(folder, tmp_path / "wrong.yaml", factor))
     focal, offset = value_of(facts, "fx_px"), value_of(facts, "time_offset_s")
@@ -144,8 +146,8 @@ def test_a_focal_length_far_off_is_found(capture: Callable[..., Path], tmp_path:
     assert abs(offset["value"] - OFFSET_S) < LARGEST_SIGMA * offset["std"]
 
 
-def test_a_focal_length_that_is_not_asked_for_is_suspected(capture: Callable[..., Path], tmp_path: Path) -> None:
-    """One line: what is seen, which focal length would explain it, and what to pass."""
+def test_a_wrong_focal_length_is_named_in_the_error(capture: Callable[..., Path], tmp_path: Path) -> None:
+    """The hint names the option to pass and the focal length ratio that would explain the motion."""
     folder = capture("plain", seed=53)
     with pytest.raises(CalibrationError, match="do not follow") as refused:
         calibrated(folder, config=wrong_focal(folder, tmp_path / "wrong.yaml", 1.8))
@@ -153,8 +155,8 @@ def test_a_focal_length_that_is_not_asked_for_is_suspected(capture: Callable[...
     assert "0.5" in str(refused.value.hint)
 
 
-def test_drifting_clocks_are_fitted_as_if_asked_for(capture: Callable[..., Path]) -> None:
-    """The fit that goes on from a single offset ends where one with a skew from the start does."""
+def test_drifting_clocks_are_fitted_without_a_request(capture: Callable[..., Path]) -> None:
+    """A fit that starts with a constant offset ends where one with a clock skew from the start does."""
     plan = plan_calibration(capture("drifting", "clock_skew=0.002", seed=54))
     gray = GrayReader(plan.capture.movie, probe_movie(plan.capture.movie))
     pairs = track_guided(plan.capture, plan.profile, gray, plan.frames)
@@ -168,8 +170,8 @@ def test_drifting_clocks_are_fitted_as_if_asked_for(capture: Callable[..., Path]
 
 
 @pytest.mark.parametrize(("blocks", "significant"), [(2.5, False), (12.0, True)])
-def test_a_drift_that_few_blocks_show_needs_more_deviations(blocks: float, significant: bool) -> None:
-    """7 σ: a normal deviate would be certain, Student's with one and a half degrees of freedom is no rarity."""
+def test_a_drift_seen_in_few_time_blocks_needs_more_deviations(blocks: float, significant: bool) -> None:
+    """7 σ would be certain for a normal distribution, but is common for Student's t with 1.5 degrees of freedom."""
     skew = SimpleNamespace(name="clock_skew", std=0.0005)
     fit = SimpleNamespace(stretches=np.array([blocks]), slices={"clock_skew": slice(0, 1)})
     found: Any = SimpleNamespace(fit=fit, values=(skew,), profile=SimpleNamespace(clock_skew=0.0035))

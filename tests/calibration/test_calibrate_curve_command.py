@@ -1,4 +1,4 @@
-"""``virest calibrate-curve`` as its users meet it."""
+"""``virest calibrate-curve`` as users see it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Virest = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def write_bracket(folder: Path, curve: ResponseCurve, wrong: dict[int, float] | None = None) -> Path:
-    """Write PNGs and their CSV; returns the CSV. ``wrong``: factors on listed exposures."""
+    """Write PNGs and their CSV; return the CSV's path. ``wrong`` gives factors on the listed exposures."""
     folder.mkdir(exist_ok=True)
     lines = ["file,exposure_s"]
     for i, picture in enumerate(make_bracket(curve, np.random.default_rng(4), width=300, height=220)):
@@ -36,8 +36,8 @@ def write_bracket(folder: Path, curve: ResponseCurve, wrong: dict[int, float] | 
     return table
 
 
-def test_a_bracket_becomes_a_block_for_the_profile(virest: Virest, tmp_path: Path) -> None:
-    """JSON as the contract has it, a YAML block that a profile takes, and a figure; nothing else is left behind."""
+def test_a_bracket_gives_a_response_block_for_a_profile(virest: Virest, tmp_path: Path) -> None:
+    """The command writes documented JSON, a YAML block that a profile accepts, and a figure; nothing else."""
     table = write_bracket(tmp_path / "bracket", FIVE, {2: 1.5})
     done = virest("calibrate-curve", "bracket", "--exposures", table, "--out", "c.yaml", "--plot", "c.png", "--json",
                   cwd=tmp_path)  # fmt: skip
@@ -57,8 +57,8 @@ def test_a_bracket_becomes_a_block_for_the_profile(virest: Virest, tmp_path: Pat
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bracket", "c.png", "c.yaml"]
 
 
-def test_people_read_a_table(virest: Virest, tmp_path: Path) -> None:
-    """Each picture with its exposure, its error and the verdict; curve.yaml unless named."""
+def test_the_curve_command_prints_a_table(virest: Virest, tmp_path: Path) -> None:
+    """Each picture has a row with its verdict; the curve is written to curve.yaml by default."""
     table = write_bracket(tmp_path / "bracket", SRGB)
     done = virest("calibrate-curve", "bracket", "--exposures", table, "--kind", "srgb", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -69,8 +69,8 @@ def test_people_read_a_table(virest: Virest, tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-def test_refusals_are_one_line_with_their_code(virest: Virest, tmp_path: Path) -> None:
-    """Nothing is written, nothing is printed but the line."""
+def test_curve_errors_are_one_line_with_their_exit_code(virest: Virest, tmp_path: Path) -> None:
+    """Nothing is written, and only the error line is printed."""
     table = write_bracket(tmp_path / "bracket", SRGB)
     rows = table.read_text().splitlines()
     (tmp_path / "one.csv").write_text("\n".join(rows[:2]) + "\n")
@@ -103,7 +103,7 @@ def test_refusals_are_one_line_with_their_code(virest: Virest, tmp_path: Path) -
 def test_a_still_capture_under_auto_exposure_gives_the_curve(
     tmp_path: Path, truth: ResponseCurve, exposures: dict[str, Any]
 ) -> None:
-    """Exposure and ISO change by steps or by a walk, through H.264 at the recorder's bit rate: within 2 grey levels."""
+    """Exposure and ISO change in steps or in a random walk; after H.264 the curve is right within 2 grey levels."""
     simulate_command(tmp_path / "trip", width=320, height=240, exposure_ms=5, rate_rad_s=0.0, readout_ms=10,
                      response=truth, seed=3, truth_frames=False, **exposures)  # fmt: skip
     facts, _ = calibrate_curve(tmp_path / "trip")
@@ -116,8 +116,8 @@ def test_a_still_capture_under_auto_exposure_gives_the_curve(
     assert not any(p["contradicts"] for p in facts["pictures"])
 
 
-def test_a_capture_whose_exposure_stays_is_refused(virest: Virest, tmp_path: Path) -> None:
-    """Exit 6: one exposure says nothing of the curve."""
+def test_a_capture_with_constant_exposure_is_refused(virest: Virest, tmp_path: Path) -> None:
+    """Exit 6: one exposure does not determine the curve."""
     simulate_command(tmp_path / "trip", width=160, height=120, frames=6, rate_rad_s=0.0)
     done = virest("calibrate-curve", "trip", cwd=tmp_path)
     assert done.returncode == 6
@@ -125,8 +125,8 @@ def test_a_capture_whose_exposure_stays_is_refused(virest: Virest, tmp_path: Pat
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_brackets_that_determine_nothing_leave_by_6(virest: Virest, tmp_path: Path) -> None:
-    """A folder of one picture, pictures all clipped, and two exposures too far apart to overlap."""
+def test_brackets_that_determine_nothing_exit_with_6(virest: Virest, tmp_path: Path) -> None:
+    """A folder of one picture, clipped pictures, and two exposures without overlap."""
     light = np.random.default_rng(8).uniform(0.0, 1.0, (90, 120, 1)).repeat(3, axis=2) ** 2 * 200 + 20
     scene = cv2.GaussianBlur(light, (0, 0), 3)
     white, black = np.full((90, 120, 3), 255, np.uint8), np.zeros((90, 120, 3), np.uint8)

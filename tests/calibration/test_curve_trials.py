@@ -1,4 +1,4 @@
-"""How a bracket's residuals change with the curve and with the exposures."""
+"""Derivatives of a bracket's residuals with respect to the curve and the exposures."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from virest.camera.response import ResponseCurve
 
 
 @pytest.mark.parametrize(("truth", "kind"), [(FIVE, "five_segment"), (GAMMA, "table"), (GAMMA, "gamma")])
-def test_slopes_are_those_of_the_residuals(truth: ResponseCurve, kind: str) -> None:
-    """At the fit, each column is the difference quotient of the residuals, the light of the places following."""
+def test_slopes_match_finite_differences(truth: ResponseCurve, kind: str) -> None:
+    """At the fit, each column equals the difference quotient of the residuals with each sample's light refitted."""
     samples = sample_bracket(make_bracket(truth, np.random.default_rng(5), count=5), np.random.default_rng(0))
     first = fit_first_curve(samples)
     family = make_family(kind, first, samples.low, samples.high, samples.top)

@@ -1,4 +1,4 @@
-"""Black, white and noise by channel and grey: what dark greys weigh, and channels that end at different greys."""
+"""Black, white and noise by channel and grey level: weights of dark greys, and channels with different end levels."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def rng() -> np.random.Generator:
 
 
 @pytest.mark.parametrize("read_noise", [12.0, 25.0])
-def test_right_dark_jpegs_are_not_accused(read_noise: float) -> None:
-    """Noise cut off at black makes the darkest pictures brighter than they are; they are not called wrong for it."""
+def test_correct_dark_jpegs_are_not_reported_as_contradicting(read_noise: float) -> None:
+    """Noise cut off at black brightens the darkest pictures; their exposures are still accepted."""
     fit = fit_response(make_dark_jpegs(SRGB, np.random.default_rng(1), read_noise=read_noise))
     assert not [p.file for p in fit.pictures if p.contradicts]
     errors = [p.exposure_error_ev for p in fit.pictures if p.exposure_error_ev is not None]
@@ -29,8 +29,8 @@ def test_right_dark_jpegs_are_not_accused(read_noise: float) -> None:
     assert curve_distance_levels(fit.curve, SRGB, fit.covered_exposure) < 3.0 * fit.curve_std_grey_levels
 
 
-def test_scanned_film_whose_channels_end_apart_has_a_curve(rng: np.random.Generator) -> None:
-    """Three blacks and three whites: the curve of their mean, and the channels' distance from it in its deviation."""
+def test_scanned_film_with_different_channel_ends_has_a_curve(rng: np.random.Generator) -> None:
+    """The curve is that of the channels' mean, and its deviation covers the distance of the channels from it."""
     ends = np.array([[5.0, 13.0, 25.0], [252.0, 245.0, 230.0]])
     fit = fit_response(make_scans(GAMMA, rng, ends))
     assert not any(p.contradicts for p in fit.pictures)
@@ -45,13 +45,13 @@ def test_scanned_film_whose_channels_end_apart_has_a_curve(rng: np.random.Genera
 
 
 def test_channels_of_an_ordinary_bracket_have_common_ends(rng: np.random.Generator) -> None:
-    """Colours of the scene are no ends: nothing is brought anywhere."""
+    """Colours of the scene are not mistaken for end levels."""
     samples = sample_bracket(make_bracket(GAMMA, rng), rng)
     assert not samples.ends.differ
 
 
-def test_ends_are_found_where_greys_rest(rng: np.random.Generator) -> None:
-    """Greys that more light does not change, within half a level; levelled ones meet, clipped ones stay."""
+def test_channel_ends_are_the_saturated_greys(rng: np.random.Generator) -> None:
+    """Greys that more light does not change give the ends. Equalised channels share them, and clipped values stay."""
     light = np.exp(rng.normal(-1.0, 2.0, (3, 1, 4000)))
     exposure = 2.0 ** np.arange(-10.0, 6.0)
     black, white = np.array([6.0, 14.0, 21.0]), np.array([250.0, 243.0, 231.0])
@@ -66,7 +66,7 @@ def test_ends_are_found_where_greys_rest(rng: np.random.Generator) -> None:
 
 
 def test_noise_is_a_table_by_grey_and_channel(rng: np.random.Generator) -> None:
-    """More noise where it is dark, and more in blue: no straight line over grey gives both."""
+    """Noise is higher in the dark and in blue; no straight line over grey describes both."""
     grey = rng.uniform(2, 253, (3, 20_000))
     true = np.array([1.0, 1.0, 4.0])[:, None] * (1.0 + 8.0 * np.exp(-grey / 30))
     pixels = 9
@@ -80,8 +80,8 @@ def test_noise_is_a_table_by_grey_and_channel(rng: np.random.Generator) -> None:
     assert at[1, 0] > 3 * at[0, 0]
 
 
-def test_scatter_tells_noise_that_squares_do_not_show(rng: np.random.Generator) -> None:
-    """Errors that a square's pixels share, found about a fit that took one part in four of them up."""
+def test_scatter_measures_noise_shared_by_a_square(rng: np.random.Generator) -> None:
+    """Errors common to a square's pixels are recovered although the fit absorbed a quarter of them."""
     grey = np.tile(rng.uniform(6, 240, (4000, 1)), (1, 4))
     sigma = np.where(grey < 40, 2.0, 0.5)
     miss = sigma * rng.standard_normal(grey.shape)
@@ -94,7 +94,7 @@ def test_scatter_tells_noise_that_squares_do_not_show(rng: np.random.Generator) 
 
 
 def test_noise_does_not_decide_what_is_dark(rng: np.random.Generator) -> None:
-    """Places a little below the limit, some lifted over it by noise, are none that were measured."""
+    """Samples just below the limit are excluded even if noise lifts them above it."""
     light = np.linspace(0.0, 20.0, 2000)[:, None]
     grey = light + rng.normal(0, 1.0, light.shape)
     limits = np.full((2000, 1), 8.0), np.full((2000, 1), 250.0)

@@ -1,4 +1,4 @@
-"""The response curve found again in brackets with known truth, and what the fit says where it cannot be."""
+"""The response curve is recovered from brackets with known truth. Brackets that do not determine it are reported."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def rng() -> np.random.Generator:
 
 
 def debevec_distance(bracket: list[BracketPicture], truth: ResponseCurve, grey: tuple[float, float]) -> float:
-    """Rms distance in grey levels of OpenCV's curve (mean of its channels) from the truth, at the best scale."""
+    """RMS distance in grey levels of OpenCV's curve (mean of its channels) from the truth, at the best scale."""
     exposures = np.array([p.exposure for p in bracket], np.float32)
     curve = cv2.createCalibrateDebevec().process([np.ascontiguousarray(p.levels) for p in bracket], exposures)
     light = np.asarray(curve).reshape(256, 3).mean(axis=1)
@@ -48,7 +48,7 @@ def debevec_distance(bracket: list[BracketPicture], truth: ResponseCurve, grey: 
 
 @pytest.mark.parametrize("truth", TRUTHS, ids=lambda c: f"{c.kind}-{c.y_max}")
 def test_the_kind_and_the_curve_are_found(truth: ResponseCurve, rng: np.random.Generator) -> None:
-    """Eight stills over 6 EV: the right kind, within half a grey level, and closer than OpenCV's Debevec."""
+    """Eight stills over 6 EV give the right kind and an error below 0.6 grey levels, less than OpenCV's Debevec."""
     bracket = make_bracket(truth, rng)
     fit = fit_response(bracket)
     assert fit.curve.kind == truth.kind
@@ -65,7 +65,7 @@ def test_the_kind_and_the_curve_are_found(truth: ResponseCurve, rng: np.random.G
 
 @pytest.mark.parametrize("truth", [FIVE, GAMMA], ids=lambda c: c.kind)
 def test_two_wrong_exposures_are_named(truth: ResponseCurve, rng: np.random.Generator) -> None:
-    """They come with their true values, nobody else is accused, and the curve stays."""
+    """Their true values are estimated, no other picture is reported, and the curve stays accurate."""
     bracket = make_bracket(truth, rng)
     wrong = list(bracket)
     wrong[1] = replace(bracket[1], exposure=bracket[1].exposure * 2**0.5)
@@ -79,8 +79,8 @@ def test_two_wrong_exposures_are_named(truth: ResponseCurve, rng: np.random.Gene
     assert curve_distance_levels(fit.curve, truth, fit.covered_exposure) < 1.5
 
 
-def test_a_curve_that_no_kind_follows_becomes_a_table(rng: np.random.Generator) -> None:
-    """A tone curve with two bends in the middle: a table within 1.5 levels; five segments are told that they fail."""
+def test_a_curve_that_no_kind_fits_becomes_a_table(rng: np.random.Generator) -> None:
+    """A tone curve with two bends gives a table within 1.5 levels; a forced five-segment fit notes that it fails."""
     x = np.linspace(0, 1, 300)
     y = np.clip(np.sqrt(x) + 0.06 * np.sin(2 * np.pi * np.sqrt(x)), 0.0, 1.0)
     truth = ResponseCurve("table", x=tuple(x.tolist()), y=tuple(y.tolist()))
@@ -96,7 +96,7 @@ def test_a_curve_that_no_kind_follows_becomes_a_table(rng: np.random.Generator) 
 
 @pytest.mark.parametrize("kind", ["linear", "srgb", "gamma", "five_segment", "table"])
 def test_every_kind_gives_a_curve_with_exact_inverse(kind: str, rng: np.random.Generator) -> None:
-    """Whatever the truth, the curve rises, is finite, and linearise undoes encode between its ends."""
+    """Whatever the truth, the curve rises and is finite, and ``linearise`` inverts ``encode`` between its ends."""
     fit = fit_response(make_bracket(GAMMA, rng, width=200, height=150, count=4, span_ev=4), kind)
     assert fit.curve.kind == kind
     low, high = fit.curve.light_range
@@ -109,20 +109,20 @@ def test_every_kind_gives_a_curve_with_exact_inverse(kind: str, rng: np.random.G
     assert np.isfinite(fit.cloud.residual).all()
 
 
-def test_five_segments_and_tables_count_exposure_from_the_brightest_covered(rng: np.random.Generator) -> None:
-    """The axis is normalised: the brightest light covered is 1."""
+def test_five_segments_and_tables_normalise_the_exposure_axis(rng: np.random.Generator) -> None:
+    """The brightest light covered is 1."""
     bracket = make_bracket(FIVE, rng, width=200, height=150, count=5, span_ev=4)
     for kind in ("five_segment", "table"):
         assert fit_response(bracket, kind).covered_exposure[1] == pytest.approx(1.0)
 
 
 def test_the_same_bracket_gives_the_same_curve(rng: np.random.Generator) -> None:
-    """Places are drawn from a seeded generator."""
+    """Samples are drawn from a seeded generator."""
     bracket = make_bracket(SRGB, rng, width=200, height=150, count=4, span_ev=4)
     assert fit_response(bracket, "gamma").curve == fit_response(bracket, "gamma").curve
 
 
-def test_grey_pictures_and_pictures_of_16_bits_do(rng: np.random.Generator) -> None:
+def test_grey_pictures_with_fractional_levels_are_accepted(rng: np.random.Generator) -> None:
     """Equal channels count once, and levels may have fractions."""
     bracket = make_bracket(GAMMA, rng, width=240, height=180)
     grey = [replace(p, levels=np.repeat(p.levels[..., 1:2], 3, axis=2).astype(np.float32)) for p in bracket]
@@ -131,8 +131,8 @@ def test_grey_pictures_and_pictures_of_16_bits_do(rng: np.random.Generator) -> N
     assert fit.curve.gamma == pytest.approx(2.2, abs=0.03)
 
 
-def test_clipped_pixels_and_a_moving_corner_do_not_pull(rng: np.random.Generator) -> None:
-    """A corner that changes from picture to picture is left out, and pictures that are white throughout are named."""
+def test_clipped_pixels_and_a_moving_corner_do_not_bias_the_curve(rng: np.random.Generator) -> None:
+    """A corner that changes between pictures is left out, and a completely white picture is named."""
     bracket = make_bracket(SRGB, rng)
     for picture in bracket:
         picture.levels[:70, :90] = rng.integers(0, 255, (70, 90, 3)) // 8 * 8
@@ -143,8 +143,8 @@ def test_clipped_pixels_and_a_moving_corner_do_not_pull(rng: np.random.Generator
     assert any(note.startswith("white.png") and "clipped" in note for note in fit.notes)
 
 
-def test_a_picture_with_hardly_a_usable_grey_does_not_spoil_the_rest(rng: np.random.Generator) -> None:
-    """An all but black picture whose few greys a codec raised: the first curve keeps its slope, nobody is accused."""
+def test_an_almost_black_picture_does_not_bias_the_others(rng: np.random.Generator) -> None:
+    """A codec brightened its few greys: the first curve keeps its slope, and the other exposures are accepted."""
     bracket = make_bracket(FIVE_LOW_TOP, rng)
     levels = 255 * FIVE_LOW_TOP.encode(FIVE_LOW_TOP.linearise(bracket[0].levels / 255) * 0.6)
     dark = BracketPicture("dark.png", np.rint(levels * 1.5 + 2).astype(np.uint8), bracket[0].exposure * 0.4)
@@ -156,8 +156,8 @@ def test_a_picture_with_hardly_a_usable_grey_does_not_spoil_the_rest(rng: np.ran
     assert np.abs(first.correction_ev[1:]).max() < 0.3
 
 
-def test_a_plateau_below_white_is_seen_through_overshoot(rng: np.random.Generator) -> None:
-    """A curve that ends at level 237 is known to, although a few pixels beyond edges reach 255."""
+def test_a_plateau_below_white_is_found_despite_overshoot(rng: np.random.Generator) -> None:
+    """The curve ends at level 237 although overshoot brings a few pixels at edges to 255."""
     bracket = make_bracket(FIVE_LOW_TOP, rng)
     for picture in bracket:
         picture.levels[(rng.uniform(size=picture.levels.shape[:2]) < 2e-3) & (picture.levels[..., 1] > 225)] = 255
@@ -169,7 +169,7 @@ def test_a_plateau_below_white_is_seen_through_overshoot(rng: np.random.Generato
     assert curve_distance_levels(fit.curve, FIVE_LOW_TOP, fit.covered_exposure) < 0.8
 
 
-# ── what equal steps of exposure leave open ──────────────────────────────────────────────────────────────────────
+# ── what equal exposure steps leave undetermined ─────────────────────────────────────────────────────────────────
 
 LIGHT = 1.2 * np.linspace(0, 1, 800) ** 3
 TONED = (LIGHT * (2.51 * LIGHT + 0.03) / (LIGHT * (2.43 * LIGHT + 0.59) + 0.14)) ** (1 / 2.2)
@@ -178,14 +178,14 @@ FILM = ResponseCurve("table", x=tuple(LIGHT.tolist()), y=tuple(TONED.tolist()))
 
 @pytest.mark.parametrize(("count", "span_ev"), [(2, 3.0), (3, 6.0), (4, 5.4)])
 def test_few_pictures_far_apart_give_a_smooth_curve(count: int, span_ev: float, rng: np.random.Generator) -> None:
-    """With a function of the steps' period upon it the curve fits as well: where nothing holds it, it is smooth."""
+    """A function with the period of the exposure steps would fit as well; regularisation keeps the curve smooth."""
     fit = fit_response(make_bracket(FILM, rng, count=count, span_ev=span_ev))
     assert fit.curve.kind == "table"
     assert curve_distance_levels(fit.curve, FILM, fit.covered_exposure) < 2.5
 
 
-def test_the_curve_s_deviation_holds_the_error(rng: np.random.Generator) -> None:
-    """Errors lie within two and a half deviations; wide steps leave more open than close ones."""
+def test_the_curve_s_deviation_covers_the_error(rng: np.random.Generator) -> None:
+    """Errors lie within 2.5 deviations; wide exposure steps give larger deviations than close ones."""
     for truth in (FILM, FIVE_LOW_TOP):
         std = {}
         for count, span_ev in ((2, 1.5), (4, 5.0), (9, 5.0)):
@@ -197,8 +197,8 @@ def test_the_curve_s_deviation_holds_the_error(rng: np.random.Generator) -> None
         assert std[9] < 1.0
 
 
-def test_a_curve_that_any_other_could_replace_is_refused(rng: np.random.Generator) -> None:
-    """Each step as wide as the curve's whole range: every place is seen black, once or twice grey, and white."""
+def test_an_undetermined_curve_is_refused(rng: np.random.Generator) -> None:
+    """With steps as wide as the curve's range, each pixel is seen black, once or twice grey, and white."""
     narrow = ResponseCurve("five_segment", b=(0.3, 0.1), c=(0.7, 0.6), y_max=0.8)
     with pytest.raises(CalibrationError, match=r"do not determine the curve|no overlap"):
         fit_response(make_bracket(narrow, rng, count=4, span_ev=6.5))
@@ -206,22 +206,22 @@ def test_a_curve_that_any_other_could_replace_is_refused(rng: np.random.Generato
     assert curve_distance_levels(fit.curve, narrow, fit.covered_exposure) < 1.5
 
 
-def test_a_kind_asked_for_that_does_not_follow_is_no_certainty(rng: np.random.Generator) -> None:
-    """Its deviation holds its distance from the truth."""
+def test_a_requested_kind_that_does_not_fit_has_a_large_deviation(rng: np.random.Generator) -> None:
+    """The deviation covers the distance from the truth."""
     fit = fit_response(make_bracket(GAMMA, rng), "linear")
     assert curve_distance_levels(fit.curve, GAMMA, fit.covered_exposure) < 2.0 * fit.curve_std_grey_levels
 
 
-def test_a_trend_within_what_lists_are_believed_keeps_the_kind(rng: np.random.Generator) -> None:
-    """Flicker of a per cent has a trend by chance, which a power of the curve would take; a trend of more is one."""
+def test_a_small_exposure_trend_keeps_the_kind(rng: np.random.Generator) -> None:
+    """A trend within the tolerance for listed exposures is treated as flicker; a larger one changes the curve."""
     for step, kind in ((0.004, "srgb"), (0.03, "table")):
         bracket = [replace(p, exposure=p.exposure * float(np.exp(step * (i - 3.5))))
                    for i, p in enumerate(make_bracket(SRGB, rng))]  # fmt: skip
         assert fit_response(bracket).curve.kind == kind
 
 
-def test_exposures_of_which_half_are_wrong_are_said_to_disagree(rng: np.random.Generator) -> None:
-    """ISO doubled halfway and not listed: none stands out, so the list as a whole is doubted."""
+def test_exposures_that_are_half_wrong_are_reported_to_disagree(rng: np.random.Generator) -> None:
+    """An unlisted doubling of the ISO halfway makes no single picture stand out, so the note doubts the whole list."""
     bracket = [
         replace(p, exposure=p.exposure * (2.0 if i > 3 else 1.0)) for i, p in enumerate(make_bracket(GAMMA, rng))
     ]
@@ -243,7 +243,7 @@ def shifted(bracket_light: np.ndarray, shifts: list[tuple[int, int]], rng: np.ra
 
 
 def test_small_shifts_are_found_and_corrected(rng: np.random.Generator) -> None:
-    """Shifts of a few pixels are measured within half a pixel and do no harm."""
+    """Shifts of a few pixels are measured within half a pixel and do not bias the curve."""
     truth = [(0, 0), (2, -1), (3, 1), (-2, 4), (1, 0), (0, -3)]
     pictures = shifted(make_scene(480, 380, rng), truth, rng)
     np.testing.assert_allclose(align_pictures(pictures), truth, atol=0.5)
@@ -253,7 +253,7 @@ def test_small_shifts_are_found_and_corrected(rng: np.random.Generator) -> None:
 
 
 def test_shifts_of_a_few_flat_patches_are_found(rng: np.random.Generator) -> None:
-    """Most of the picture is flat, its noise fills most ranks: the edges count all the same."""
+    """Most of the picture is flat and noise dominates most ranks; the edges still determine the shifts."""
     light = np.full((380, 480, 3), 0.18, np.float32)
     for i in range(6):
         y, x = 50 + 150 * (i // 3), 60 + 140 * (i % 3)
@@ -263,8 +263,8 @@ def test_shifts_of_a_few_flat_patches_are_found(rng: np.random.Generator) -> Non
     np.testing.assert_allclose(align_pictures(pictures), truth, atol=0.5)
 
 
-def test_large_shifts_and_turns_are_refused(rng: np.random.Generator) -> None:
-    """Exit 6, with the picture's name."""
+def test_large_shifts_and_rotations_are_refused(rng: np.random.Generator) -> None:
+    """For a shift the error names the picture."""
     light = make_scene(480, 380, rng)
     with pytest.raises(CalibrationError, match=r"3\.png is shifted by"):
         fit_response(shifted(light, [(0, 0), (0, 0), (0, 0), (17, 9), (0, 0)], rng))
@@ -280,8 +280,8 @@ def test_large_shifts_and_turns_are_refused(rng: np.random.Generator) -> None:
 # ── refusals ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_what_data_cannot_determine_is_refused(rng: np.random.Generator) -> None:
-    """One picture, one exposure, no overlap, all clipped, a scene that is not still: exit 6 and the reason."""
+def test_undetermined_brackets_are_refused(rng: np.random.Generator) -> None:
+    """One picture, one exposure, no overlap, clipped pictures, or a moving scene: exit 6 and the reason."""
     bracket = make_bracket(GAMMA, rng, width=240, height=180)
     other = make_bracket(GAMMA, np.random.default_rng(99), width=240, height=180)
     black, white = np.zeros_like(bracket[0].levels), np.full_like(bracket[0].levels, 255)
@@ -299,24 +299,24 @@ def test_what_data_cannot_determine_is_refused(rng: np.random.Generator) -> None
         assert "\n" not in str(refusal.value)
 
 
-def test_an_unknown_kind_is_a_setting_error(rng: np.random.Generator) -> None:
-    """Kinds are named."""
+def test_an_unknown_kind_is_a_settings_error(rng: np.random.Generator) -> None:
+    """The error lists the known kinds."""
     with pytest.raises(SettingsError, match="five_segment"):
         fit_response(make_bracket(SRGB, rng, width=200, height=150), "cubic")
 
 
-def test_few_and_narrow_brackets_are_said_to_be_weak(rng: np.random.Generator) -> None:
-    """Three pictures over 1 EV: a result with notes."""
+def test_few_and_narrow_brackets_are_noted_as_weak(rng: np.random.Generator) -> None:
+    """Three pictures over 1 EV give a result with notes."""
     fit = fit_response(make_bracket(SRGB, rng, width=240, height=180, count=3, span_ev=1.0), "srgb")
     assert any("too few" in note for note in fit.notes)
     assert any("weakly" in note for note in fit.notes)
 
 
-# ── laws of the parts ────────────────────────────────────────────────────────────────────────────────────────────
+# ── properties of the parts ──────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_line_is_not_bent_by_two_of_seven_points() -> None:
-    """The level and trend of most points."""
+def test_two_outliers_of_seven_do_not_bend_a_line() -> None:
+    """The robust line follows the level and trend of most points."""
     x = np.array([0.0, 0.9, 2.1, 2.8, 4.2, 5.0, 6.1])
     y = 0.3 - 0.07 * x
     y[[1, 5]] += [0.4, -0.6]
@@ -325,8 +325,8 @@ def test_a_line_is_not_bent_by_two_of_seven_points() -> None:
 
 
 @pytest.mark.parametrize("curve", TRUTHS, ids=lambda c: f"{c.kind}-{c.y_max}")
-def test_the_look_up_agrees_with_the_curve(curve: ResponseCurve) -> None:
-    """Within a tenth of a grey level, both ways."""
+def test_the_lookup_table_agrees_with_the_curve(curve: ResponseCurve) -> None:
+    """It agrees within 0.1 grey levels, and its inverse within 0.001."""
     light = np.geomspace(max(curve.light_range[0] * 1.05, 0.002), curve.light_range[1] * 0.98, 300)
     lookup = log_lookup(curve)
     np.testing.assert_allclose(lookup.level(np.log(light)), 255 * curve.encode(light), atol=0.1)
@@ -335,7 +335,7 @@ def test_the_look_up_agrees_with_the_curve(curve: ResponseCurve) -> None:
 
 
 def test_scaling_the_exposure_axis_keeps_the_curve() -> None:
-    """E over x / unit is the scaled curve; its distance is zero at the best scale."""
+    """Encoding x / unit with the scaled curve equals encoding x; the distance of the two curves is zero."""
     table = table_curve(np.linspace(-1, 0.3, 9), np.linspace(6, 250, 10), 255.0)
     for curve in (FIVE, table):
         light = np.linspace(*curve.light_range, 50)
@@ -343,8 +343,8 @@ def test_scaling_the_exposure_axis_keeps_the_curve() -> None:
         assert curve_distance_levels(scale_exposure(curve, 1.7), curve, (0.1, 0.5)) < 0.01
 
 
-def test_structure_is_seen_above_noise(rng: np.random.Generator) -> None:
-    """Noise alone gives next to none, a wave over grey its rms."""
+def test_residual_structure_is_measured_above_noise(rng: np.random.Generator) -> None:
+    """Pure noise gives almost no structure; a wave over grey gives its RMS."""
     grey = rng.uniform(5, 250, 20_000)
     noise = rng.standard_normal(20_000)
     assert residual_structure(grey, noise) < 0.05
@@ -352,8 +352,8 @@ def test_structure_is_seen_above_noise(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_pictures_of_one_exposure_under_a_list_of_many_are_refused(seed):
-    """Five pictures that were all taken alike, listed over 8 EV: no traceback, and no curve."""
+def test_equal_exposures_listed_as_different_are_refused(seed):
+    """Five pictures with one exposure, listed over 8 EV, give an error instead of a curve."""
     rng = np.random.default_rng(seed)
     light = make_scene(420, 310, rng)
     true = [1.0] * 5 + [2.0**k for k in (-3, -1, 1, 2)]

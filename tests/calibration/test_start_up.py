@@ -1,4 +1,4 @@
-"""Lag schedules of hand-made repeats."""
+"""Lag schedules of synthetic repeated frames."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ PERIOD_S = 0.04
 
 
 def capture(frames: int) -> Capture:
-    """A movie of 25 frames a second that drops one in the middle."""
+    """A movie of 25 frames per second that drops one in the middle."""
     stamp_s = PERIOD_S * (np.arange(frames) + (np.arange(frames) > frames // 2))
     imu = ImuSamples(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
     records = tuple(Frame(k, 0, float(t)) for k, t in enumerate(stamp_s))
     return Capture("c", Path("c"), Path("c"), 64, 48, records, imu, CaptureMetadata(), "REALTIME", 0)
 
 
-def test_without_repeats_there_is_nothing_to_try() -> None:
-    """No repeat, no schedule."""
+def test_without_repeats_there_is_no_schedule() -> None:
+    """Without a repeated frame, no lag is tried."""
     assert lag_schedules(capture(30), []) == []
 
 
-def test_each_repeat_uses_up_a_period() -> None:
-    """Repeats at 2, 5 and 6 of thirty: three periods late at first, two from slot 2, one from 5, none from 6 on."""
+def test_each_repeat_reduces_the_lag_by_a_period() -> None:
+    """With repeats at 2, 5 and 6 of 30 frames, the lag falls from three periods to none."""
     ((lag_s, last, seconds),) = lag_schedules(capture(30), [5, 2, 6])
     assert lag_s == pytest.approx(3 * PERIOD_S)
     assert last == 6
@@ -40,7 +40,7 @@ def test_each_repeat_uses_up_a_period() -> None:
 
 
 def test_a_recording_that_ends_while_it_lags_may_lag_longer() -> None:
-    """Repeats up to the movie's end leave open what was left: every schedule a constant above the first."""
+    """Repeats up to the end of the movie leave the remaining lag unknown: the schedules differ by a constant."""
     found = lag_schedules(capture(12), [3, 10])
     assert [entry[0] for entry in found] == pytest.approx([PERIOD_S * (2 + extra) for extra in EXTRA_PERIODS])
     assert [entry[1] for entry in found] == [10] * len(EXTRA_PERIODS)
@@ -49,8 +49,11 @@ def test_a_recording_that_ends_while_it_lags_may_lag_longer() -> None:
         np.testing.assert_allclose(seconds, PERIOD_S * (base + extra), atol=1e-12)
 
 
-def test_turns_tell_whether_the_repeats_are_a_lag() -> None:
-    """Two periods late at first, one from slot 9, none from 14: found; the same repeats on time: not believed."""
+def test_rotation_shows_whether_repeats_are_a_lag() -> None:
+    """A lag of two periods, then one from slot 9, then none from 14 is found.
+
+    The same repeats without lag are rejected.
+    """
     recording = Recording(Setup(seed=71, frames=40, points=20, gyro_noise_rad_s=0.001))
     stamp_s, period_s = recording.stamp_s, 1 / 29.7
     late_s = period_s * np.array([2] * 9 + [1] * 5 + [0] * 26)

@@ -1,4 +1,4 @@
-"""What is said of values that a calibration held fixed although the points contradict them."""
+"""Notes about parameters that a calibration kept fixed although the tracked points contradict them."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,18 +14,18 @@ from virest.camera.profile import CameraProfile
 
 
 def held(name: str, change: Any, std: Any) -> dict[str, HeldValue]:
-    """One such value."""
+    """One such parameter."""
     return {name: HeldValue(name, np.atleast_1d(np.array(change, float)), np.atleast_1d(np.array(std, float)))}
 
 
-def test_every_optional_value_has_its_bound() -> None:
-    """None can be called wrong without it; those of the lens are named first."""
+def test_every_optional_parameter_has_a_plausibility_bound() -> None:
+    """A huge change is implausible for each of them; those of the lens are listed first."""
     assert all(not HeldValue(name, np.array([1e9]), np.ones(1)).believable for name in OPTIONAL)
     assert list(OPTIONAL)[:3] == ["focal", "distortion", "principal-point"]
 
 
-def test_what_is_not_determined_goes_back_to_where_it_was() -> None:
-    """Value by value, as the table of effects says; a readout keeps the middle row's time."""
+def test_an_undetermined_parameter_is_reset() -> None:
+    """Each parameter is reset as in the table of effects; a reset readout time keeps the time of the middle row."""
     lens = Intrinsics(640, 480, 500.0, 500.0, 319, 239)
     given = CameraProfile(640, 480, intrinsics=lens, time_offset_s=0.01, clock_skew=1e-4)
     shutter = replace(given.shutter, readout_time_s=0.03)
@@ -44,13 +44,13 @@ def test_what_is_not_determined_goes_back_to_where_it_was() -> None:
     assert held.intrinsics == replace(lens, cx_px=330.0)
 
 
-def test_values_that_fit_are_not_mentioned() -> None:
-    """Five and six deviations are not the same."""
+def test_a_significant_but_small_change_is_not_noted() -> None:
+    """A change of five deviations is below the limit."""
     assert held_notes({**held("focal", 0.01, 0.002), **held("principal-point", [5, 2], [1, 1])}, ()) == []
 
 
-def test_a_wrong_value_is_named_with_its_size_and_what_to_do() -> None:
-    """All that was fitted is asked for again."""
+def test_a_wrong_parameter_is_named_with_its_size_and_the_option() -> None:
+    """The suggested option also lists the parameters already fitted."""
     values = {**held("focal", np.log(0.97), 0.002), **held("principal-point", [1, -9], [1, 0.5])}
     (note,) = held_notes(values, ["clock-skew"])
     assert "focal (-3.0% ± 0.2%)" in note
@@ -58,16 +58,19 @@ def test_a_wrong_value_is_named_with_its_size_and_what_to_do() -> None:
     assert "--with clock-skew,focal,principal-point" in note
 
 
-def test_what_no_phone_can_be_is_a_sign_of_something_else() -> None:
-    """An exposure of next to nothing: the stamps mean another instant."""
+def test_an_implausible_change_suggests_another_cause() -> None:
+    """An exposure near zero means that timestamps refer to another instant: the note suggests ``virest diagnose``."""
     (note,) = held_notes({**held("exposure-scale", -3.1, 0.1), **held("focal", 0.03, 0.002)}, ())
     assert "exposure-scale (-95.5%" in note
     assert "virest diagnose" in note
     assert "--with" not in note
 
 
-def test_a_focal_length_of_another_resolution_is_named_as_such() -> None:
-    """No lens is off by half, but a profile may be; other values that are off beside it are no reason to doubt that."""
+def test_a_focal_length_of_another_resolution_is_recognised() -> None:
+    """A factor of 2 points to a profile of another resolution.
+
+    Another plausible change keeps this note, an implausible one does not.
+    """
     values = {**held("focal", np.log(2.0), 0.005), **held("distortion", 0.05, 0.002)}
     (note,) = held_notes(values, ["clock-skew"])
     assert "focal (+100.0%" in note
@@ -81,14 +84,16 @@ def test_a_focal_length_of_another_resolution_is_named_as_such() -> None:
     ("change", "std", "said"),
     [(0.04, 0.01, "is absorbing a wrong gyro-scale"), (0.01, 0.02, "depends on gyro-scale"), (0.01, 0.005, None)],
 )
-def test_a_fitted_values_twin_is_asked_more_strictly(change: float, std: float, said: str | None) -> None:
-    """Focal length and gyroscope scale make up for each other."""
+def test_a_parameter_correlated_with_a_fitted_one_is_checked_more_strictly(
+    change: float, std: float, said: str | None
+) -> None:
+    """Focal length and gyroscope scale compensate for each other."""
     notes = held_notes(held("gyro-scale", change, std), ["focal"])
     assert [said in note for note in notes] == ([True] if said else [])
 
 
 def test_the_deviation_of_an_unknown_focal_length_is_in_pixels() -> None:
-    """What stands in a column of pixels is pixels, also where the value is not determined and not taken."""
+    """The deviation is 0.053 focal lengths, also for a value that is undetermined and not adopted."""
     lens = Intrinsics(640, 480, 520.0, 520.0, 319, 239)
     unknown, fitted = CameraProfile(640, 480), CameraProfile(640, 480, intrinsics=lens)
     value = value_of("focal_length", unknown, unknown, fitted, np.array([0.053**2]), determined=False)

@@ -1,4 +1,4 @@
-"""Fields: what their values say between knots, how a profile holds them, and what the lens and shutter make of them."""
+"""Fields: interpolation between knots, storage in a profile, and their effect on lens and shutter."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ LENS = Intrinsics(640, 480, 510.0, 505.0, 322.0, 236.0, "radtan", (-0.05, 0.01, 
 
 
 def bent() -> Field:
-    """A displacement of a few pixels, not symmetric."""
+    """An asymmetric displacement of a few pixels."""
     x, y = (0.0, 200.0, 430.0, 639.0), (0.0, 150.0, 479.0)
     values = [(1e-5 * a * b - 0.5, 2e-5 * (b - 200) * a / 2 + 0.3) for a in x for b in y]
     return Field("displacement", ("x", "y"), (x, y), tuple(values))
@@ -68,23 +68,23 @@ def camera() -> CameraProfile:
     return CameraProfile(640, 480, intrinsics=LENS, shutter=Shutter(0.02, "bottom_to_top"), time_offset_s=0.0)
 
 
-def test_a_field_runs_through_its_values_and_holds_its_ends() -> None:
-    """A parabola comes back between the knots of a cubic spline; beyond them nothing is made up."""
+def test_a_field_interpolates_its_values_and_is_constant_outside() -> None:
+    """A cubic spline reproduces a parabola between the knots and does not extrapolate."""
     along = np.linspace(0, 1, 37)
     assert LATE.at(along)[:, 0] == pytest.approx(0.006 * along * (1 - along) + 0.001 * along, abs=1e-12)
     assert LATE.at(np.array([-3.0, 5.0]))[:, 0] == pytest.approx([0.0, 0.001])
 
 
-def test_a_blur_runs_straight_between_its_knots() -> None:
-    """A spline through a short blur would swing, and blur frames that are sharp."""
+def test_a_blur_field_is_piecewise_linear() -> None:
+    """A spline through a short blur would oscillate and blur sharp frames."""
     blur = Field("blur", ("time",), ((0.0, 1.2, 1.5, 2.3),), ((0.0,), (0.2,), (2.0,), (0.0,)))
     assert blur.at_time(np.array([0.6, 1.35, 1.9]))[:, 0] == pytest.approx([0.1, 1.1, 1.0])
     with pytest.raises(SettingsError, match="0 or more"):
         blur.with_values(-np.array(blur.values))
 
 
-def test_over_the_picture_the_second_covariate_runs_fastest() -> None:
-    """Values stand where they are written, and are exact for a product of both."""
+def test_over_the_frame_the_second_covariate_varies_fastest() -> None:
+    """Values at the knots are as written, and interpolation is exact for a product of both covariates."""
     field = bent()
     assert field.at(430.0, 150.0) == pytest.approx(field.values[2 * 3 + 1])
     assert field.at(np.array([[77.0, 500.0]]), np.array([[33.0, 401.0]]))[0, 1, 0] == pytest.approx(
@@ -93,7 +93,7 @@ def test_over_the_picture_the_second_covariate_runs_fastest() -> None:
 
 
 def test_a_profile_with_fields_is_read_as_it_was_written() -> None:
-    """YAML keeps every number, the deviations, and the capture that a field belongs to."""
+    """YAML keeps all numbers and the capture that a field belongs to."""
     profile = replace(camera().with_fields(every_kind()), imu_untrusted_s=((1.4, 1.55),), imu_untrusted_stamp_0_ns=9)
     again = parse_profile(yaml.safe_load(format_profile(profile)))
     assert again.fields == profile.fields
@@ -115,7 +115,7 @@ def test_a_profile_with_fields_is_read_as_it_was_written() -> None:
         ({"version": 3}, "version"),
     ],
 )
-def test_a_field_that_cannot_be_is_refused_with_its_place(change: dict[str, object], said: str) -> None:
+def test_an_invalid_field_is_refused(change: dict[str, object], said: str) -> None:
     """A wrong kind, covariate, knot, number of values or version."""
     content = yaml.safe_load(format_profile(camera().with_fields([LATE])))
     content["extensions"]["field"][0].update(change)
@@ -123,16 +123,16 @@ def test_a_field_that_cannot_be_is_refused_with_its_place(change: dict[str, obje
         parse_profile(content, "camera.yaml")
 
 
-def test_a_stretch_that_ends_before_it_starts_is_refused() -> None:
-    """It would never be honoured."""
+def test_an_untrusted_interval_must_end_after_its_start() -> None:
+    """Such an interval would never apply."""
     content = yaml.safe_load(format_profile(camera()))
     content["imu_untrusted_s"] = [[2.0, 1.0]]
     with pytest.raises(SettingsError, match="end after it starts"):
         parse_profile(content)
 
 
-def test_uneven_rows_start_late_by_the_field() -> None:
-    """The delay adds to an even readout; the place among the rows stays what it is."""
+def test_uneven_rows_start_later_by_the_delay_field() -> None:
+    """The delay adds to an even readout; the row fraction of a point is unchanged."""
     even = Shutter(0.02, "bottom_to_top")
     points = np.array([[10.0, 300.0], [500.0, 40.0]])
     late = replace(even, uneven=LATE)
@@ -142,8 +142,8 @@ def test_uneven_rows_start_late_by_the_field() -> None:
     assert added_s == pytest.approx(0.006 * fraction * (1 - fraction) + 0.001 * fraction)
 
 
-def test_a_displaced_lens_projects_what_its_rays_see() -> None:
-    """Rays and projection are inverse, and differ from the plain lens by the field where it would put the point."""
+def test_a_displaced_lens_inverts_its_rays() -> None:
+    """Projection differs from the plain lens by the field's value at the point's undisplaced position."""
     lens = replace(LENS, displaced=bent())
     points = np.stack(np.meshgrid(np.linspace(5, 630, 9), np.linspace(5, 470, 7)), axis=-1)
     assert lens.project(lens.rays(points)) == pytest.approx(points, abs=1e-4)
@@ -151,8 +151,8 @@ def test_a_displaced_lens_projects_what_its_rays_see() -> None:
     assert lens.project(rays) - points == pytest.approx(bent().at(points[..., 0], points[..., 1]), abs=1e-6)
 
 
-def test_times_can_be_counted_from_later() -> None:
-    """The same instants keep their values."""
+def test_a_field_can_be_shifted_in_time() -> None:
+    """Values at the same instants stay the same."""
     field = every_kind()[2]
     assert field.later(0.3).at_time(0.4) == pytest.approx(field.at_time(0.7))
     late, drawn, _ = PAIRS
@@ -160,7 +160,7 @@ def test_times_can_be_counted_from_later() -> None:
     assert drawn.later(0.3).at_time(0.4, 150.0) == pytest.approx(drawn.at_time(0.7, 150.0))
 
 
-def test_entries_over_pairs_of_covariates_say_their_version() -> None:
-    """A program that knows no pairs refuses the file instead of reading it wrongly."""
+def test_fields_over_two_covariates_have_version_2() -> None:
+    """A program that does not know such fields rejects the file instead of misreading it."""
     content = yaml.safe_load(format_profile(camera().with_fields([LATE, *PAIRS])))
     assert [entry["version"] for entry in content["extensions"]["field"]] == [1, 2, 2, 2]

@@ -1,4 +1,4 @@
-"""The lens: pixels and rays are each other's inverse, and OpenCV agrees."""
+"""The lens: projection inverts rays, and OpenCV agrees."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def _lens(lens: Model, focal_px: float = 412.0) -> Intrinsics:
 
 
 def _pixels() -> NDArray[np.float64]:
-    """Give the picture's corners, its edges and its inside."""
+    """Pixels at the corners, the edges and inside the frame."""
     x, y = np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 359, 7))
     return np.stack([x, y], -1)
 
 
 @pytest.mark.parametrize("tangential", [(0.0, 0.0), (0.001, -0.0005)])
-def test_where_a_lens_folds_its_picture_back_rays_end(tangential: tuple[float, float]) -> None:
-    """At k1 −0.2 nothing is seen beyond 0.86 focal lengths: pixels there have rays that hardly depend on the lens."""
+def test_rays_are_bounded_where_a_lens_folds_back(tangential: tuple[float, float]) -> None:
+    """With k1 = −0.2 nothing is visible beyond 0.86 focal lengths. Rays of pixels outside hardly depend on the lens."""
 
     def rays(k1: float) -> NDArray[np.float64]:
         lens = Intrinsics(640, 360, 330.0, 330.0, 390.0, 205.0, "radtan", (k1, 0.0, *tangential, 0.0))
@@ -50,14 +50,14 @@ def test_where_a_lens_folds_its_picture_back_rays_end(tangential: tuple[float, f
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_project_undoes_rays(lens: Model) -> None:
-    """The ray through a pixel lands on that pixel again, at the picture's corners too."""
+def test_projection_inverts_rays(lens: Model) -> None:
+    """The ray through a pixel projects to that pixel, also at the corners."""
     camera = _lens(lens)
     assert_round_trip(camera.rays, camera.project, _pixels(), atol=1e-6)
 
 
 def test_wide_fisheye_reaches_its_corners() -> None:
-    """A fisheye of 150 degrees across its diagonal still inverts at its corners."""
+    """A fisheye of more than 130° across its diagonal can be inverted at its corners."""
     camera = _lens(FISHEYE, focal_px=280.0)
     assert_round_trip(camera.rays, camera.project, _pixels(), atol=1e-6)
     half_angle = np.degrees(np.arctan(np.linalg.norm(camera.rays(np.array([[0.0, 359.0]]))[0, :2])))
@@ -67,13 +67,13 @@ def test_wide_fisheye_reaches_its_corners() -> None:
 @settings(max_examples=40, deadline=None)
 @given(k1=st.floats(-0.12, 0.25), k2=st.floats(-0.02, 0.04), p1=st.floats(-0.004, 0.004), p2=st.floats(-0.004, 0.004))
 def test_any_mild_lens_round_trips(k1: float, k2: float, p1: float, p2: float) -> None:
-    """Whatever mild distortion a phone has, rays and pixels are inverse over the whole picture."""
+    """For mild distortions, as in phones, projection inverts rays over the whole frame."""
     camera = _lens(("radtan", (k1, k2, p1, p2, 0.0)))
     assert_round_trip(camera.rays, camera.project, _pixels(), atol=1e-6)
 
 
 @pytest.mark.parametrize("lens", [UNDISTORTED, RADTAN])
-def test_project_is_opencvs(lens: Model) -> None:
+def test_projection_equals_opencvs(lens: Model) -> None:
     """Brown's model has OpenCV's coefficients in OpenCV's order."""
     camera = _lens(lens)
     rays = np.random.default_rng(1).uniform((-0.7, -0.4, 0.8), (0.7, 0.4, 1.3), (50, 3))
@@ -81,7 +81,7 @@ def test_project_is_opencvs(lens: Model) -> None:
     np.testing.assert_allclose(camera.project(rays), expected[:, 0], atol=1e-8)
 
 
-def test_fisheye_is_opencvs() -> None:
+def test_fisheye_projection_equals_opencvs() -> None:
     """The fisheye has OpenCV's coefficients in OpenCV's order."""
     camera = _lens(FISHEYE)
     rays = np.random.default_rng(2).uniform((-2, -1, 0.8), (2, 1, 1.3), (50, 3))
@@ -92,7 +92,7 @@ def test_fisheye_is_opencvs() -> None:
 
 
 def test_axes_are_x_right_y_down_z_forward() -> None:
-    """What lies right of and below the optical axis has larger pixel coordinates; the axis meets (cx, cy)."""
+    """Points right of and below the optical axis have larger pixel coordinates; the axis projects to (cx, cy)."""
     camera = _lens(RADTAN)
     centre, right, below = camera.project(np.array([[0, 0, 2.0], [0.2, 0, 2.0], [0, 0.2, 2.0]]))
     np.testing.assert_allclose(centre, (331.2, 171.9))
@@ -100,8 +100,8 @@ def test_axes_are_x_right_y_down_z_forward() -> None:
     assert below[1] > centre[1] + 30
 
 
-def test_depth_does_not_matter_to_a_ray() -> None:
-    """A ray's length changes no pixel, and rays come with z = 1."""
+def test_a_ray_s_length_does_not_matter() -> None:
+    """Scaling a ray changes no pixel, and rays are returned with z = 1."""
     camera = _lens(FISHEYE)
     rays = camera.rays(_pixels())
     np.testing.assert_array_equal(rays[..., 2], 1.0)
@@ -109,7 +109,7 @@ def test_depth_does_not_matter_to_a_ray() -> None:
 
 
 def test_scaled_focal_scales_both_and_keeps_the_rest() -> None:
-    """A longer focal length moves pixels away from the principal point, and nothing else changes."""
+    """A longer focal length moves pixels away from the principal point."""
     camera = _lens(UNDISTORTED)
     ray = np.array([[0.3, -0.2, 1.0]])
     moved = camera.scaled_focal(1.1).project(ray) - (331.2, 171.9)
@@ -117,7 +117,10 @@ def test_scaled_focal_scales_both_and_keeps_the_rest() -> None:
 
 
 def test_only_a_lens_without_any_effect_counts_as_undistorted() -> None:
-    """A radtan lens of zeros bends nothing; an equidistant fisheye does, even with zero coefficients."""
+    """A radtan lens with zero coefficients has no distortion.
+
+    An equidistant fisheye has some even with zero coefficients.
+    """
     assert not _lens(UNDISTORTED).is_distorted
     assert not _lens(("radtan", (0.0,) * 5)).is_distorted
     assert _lens(("fisheye", (0.0,) * 4)).is_distorted
@@ -125,6 +128,6 @@ def test_only_a_lens_without_any_effect_counts_as_undistorted() -> None:
 
 @pytest.mark.parametrize("lens", [("brown", ()), ("radtan", (0.1, 0.2)), ("none", (0.1,)), ("fisheye", (0.0,) * 5)])
 def test_unknown_models_and_wrong_counts_are_refused(lens: Model) -> None:
-    """A model that is not known, or too few or many coefficients, is a settings error that names the model."""
+    """An unknown model or a wrong number of coefficients is a settings error that names the model."""
     with pytest.raises(SettingsError, match=lens[0]):
         _lens(lens)

@@ -1,4 +1,4 @@
-"""Kalibr's files, read and written."""
+"""Reading and writing Kalibr's files."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ CHAIN = {
 
 
 def test_a_camchain_file_becomes_a_profile(tmp_path):
-    """Intrinsics, distortion, pose, time shift and line delay arrive in the profile."""
+    """The profile has the file's intrinsics, distortion, pose, time shift and line delay."""
     path = tmp_path / "camchain-imucam.yaml"
     path.write_text(yaml.safe_dump(CHAIN))
     profile = read_any_profile(path)
@@ -49,22 +49,22 @@ def test_a_camchain_file_becomes_a_profile(tmp_path):
     assert profile.shutter.readout_time_s == pytest.approx(0.02016)
 
 
-def test_an_equidistant_lens_is_our_fisheye():
-    """Kalibr's equidistant model is the Kannala-Brandt fisheye."""
+def test_an_equidistant_lens_is_read_as_fisheye():
+    """Kalibr's equidistant model is the Kannala–Brandt fisheye."""
     chain = {"cam0": {**CHAIN["cam0"], "distortion_model": "equidistant"}}
     assert parse_camchain(chain).intrinsics.model == "fisheye"
 
 
 @pytest.mark.parametrize("key", ["resolution", "intrinsics", "distortion_coeffs"])
 def test_a_missing_key_is_named(key):
-    """A chain that lacks a needed key is refused with that key's name."""
+    """A chain without a required key is rejected, and the error names the key."""
     chain = {"cam0": {k: v for k, v in CHAIN["cam0"].items() if k != key}}
     with pytest.raises(SettingsError, match=key):
         parse_camchain(chain)
 
 
-def test_our_own_profile_is_no_camchain():
-    """A profile of ours is never taken for a camera chain."""
+def test_a_virest_profile_is_not_a_camchain():
+    """A virest profile is never read as a camera chain."""
     assert is_kalibr(CHAIN)
     assert not is_kalibr({"virest_profile": 1})
 
@@ -84,12 +84,12 @@ PROFILE = CameraProfile(
 
 
 def reread(text: str) -> CameraProfile:
-    """Parse what was written."""
+    """Parse a written chain."""
     return parse_camchain(yaml.safe_load(text))
 
 
 def comments(text: str) -> str:
-    """Everything that is a comment."""
+    """All comments of a file."""
     return "\n".join(line for line in text.splitlines() if line.startswith("#"))
 
 
@@ -102,8 +102,8 @@ def comments(text: str) -> str:
     ],
     ids=["radtan", "none", "fisheye"],
 )
-def test_a_camchain_that_was_written_reads_back_the_same(lens):
-    """Lens, pose, offset and a readout from top to bottom survive the way to Kalibr and back."""
+def test_a_written_camchain_reads_back_the_same(lens):
+    """Lens, pose, offset and a top-to-bottom readout are written and read without loss."""
     back = reread(format_camchain(replace(PROFILE, intrinsics=lens)))
     assert back.intrinsics == lens
     assert back.p_cam_imu_m == PROFILE.p_cam_imu_m
@@ -120,8 +120,8 @@ def test_the_line_delay_is_the_readout_of_one_row():
 
 
 @pytest.mark.parametrize("direction", ["bottom_to_top", "left_to_right", "right_to_left"])
-def test_a_readout_that_kalibr_does_not_know_is_said_and_its_middle_kept(direction):
-    """Such a shutter becomes a global one that sees the picture when its middle row is read, with a comment."""
+def test_an_unsupported_readout_direction_is_written_as_global(direction):
+    """The global shutter has the time of the middle row, and a comment names the direction."""
     text = format_camchain(replace(PROFILE, shutter=Shutter(0.0217, direction)))
     assert direction in comments(text)
     assert "line_delay_nanoseconds" not in yaml.safe_load(text)["cam0"]
@@ -130,16 +130,16 @@ def test_a_readout_that_kalibr_does_not_know_is_said_and_its_middle_kept(directi
     assert back.time_offset_s == pytest.approx(-0.0173 + 0.0217 / 2)
 
 
-def test_a_stamp_of_the_exposure_s_end_is_brought_to_its_start():
-    """Kalibr's chain is read as exposure_start: the shift takes one true exposure away, and the comment says more."""
+def test_a_timestamp_at_exposure_end_is_shifted_to_exposure_start():
+    """A Kalibr chain is read as exposure_start: the shift subtracts a true exposure; a comment gives half of it."""
     shutter = replace(PROFILE.shutter, timestamp="exposure_end", exposure_scale=1.5)
     text = format_camchain(replace(PROFILE, shutter=shutter), exposure_s=0.008)
     assert reread(text).time_offset_s == pytest.approx(-0.0173 - 0.012)
     assert "6 ms later" in comments(text)
 
 
-def test_what_is_lost_is_named_in_comments():
-    """Curve, clock rate, bias, a third radial coefficient and extensions have no place in a camera chain."""
+def test_unsupported_values_are_named_in_comments():
+    """A camera chain cannot hold the curve, clock skew, bias, third radial coefficient or extensions."""
     rich = replace(
         PROFILE,
         intrinsics=replace(LENS, coefficients=(0.11, -0.23, 0.0013, -0.0024, 0.031)),
@@ -156,7 +156,7 @@ def test_what_is_lost_is_named_in_comments():
 
 
 def test_unknown_values_are_left_out_and_an_unknown_lens_is_refused():
-    """Neither an offset nor a readout is made up; a chain without focal length cannot be."""
+    """No offset or readout is invented; a chain requires a focal length."""
     back = reread(format_camchain(replace(PROFILE, time_offset_s=None, readout_known=False, shutter=Shutter())))
     assert back.time_offset_s is None
     assert not back.readout_known
@@ -169,13 +169,13 @@ def test_unknown_values_are_left_out_and_an_unknown_lens_is_refused():
 NOISE = ImuNoise(198.5, 1.7e-4, 2.3e-3, 3.1e-6, 7.7e-5, "/phone/imu")
 
 
-def test_imu_yaml_reads_back_what_was_written():
-    """Five numbers and the topic, with tiny ones that YAML 1.1 would read as text."""
+def test_a_written_imu_yaml_reads_back_the_same():
+    """Five numbers and the topic, including small numbers that YAML 1.1 would read as text."""
     assert parse_imu(yaml.safe_load(format_imu(NOISE))) == NOISE
 
 
-def test_kalibr_s_own_result_is_read_too():
-    """Kalibr writes the same keys below ``imu0``, beside keys that mean nothing here."""
+def test_kalibr_s_own_imu_result_is_read():
+    """Kalibr writes the same keys below ``imu0``, beside others that are ignored."""
     block = {"T_i_b": [[1, 0, 0, 0]], "gyroscope_noise_density": "1e-4", "update_rate": 400, "rostopic": "/imu"}
     read = parse_imu({"imu0": block})
     assert (read.update_rate_hz, read.gyro_density, read.accel_density, read.topic) == (400.0, 1e-4, None, "/imu")
@@ -191,14 +191,14 @@ def test_kalibr_s_own_result_is_read_too():
         ({"imu0": [1, 2]}, "imu0"),
     ],
 )
-def test_a_faulty_imu_yaml_is_refused_by_its_key(content, says):
-    """Missing, zero, and not a number: the key is named."""
+def test_the_error_for_a_faulty_imu_yaml_names_the_key(content, says):
+    """The value is missing, zero or not a number."""
     with pytest.raises(SettingsError, match=says):
         parse_imu(content)
 
 
-def test_an_unknown_walk_gets_a_usual_value_and_says_so_an_unknown_density_stays_out():
-    """Kalibr needs the walks, which no short capture can tell; a missing sensor gets no density."""
+def test_an_unknown_random_walk_gets_a_default_and_a_comment():
+    """Kalibr needs random walks, which a short capture does not determine. An unknown noise density is left out."""
     text = format_imu(ImuNoise(100.0, 1e-4, None))
     content = yaml.safe_load(text)
     assert content["gyroscope_random_walk"] > 0
@@ -207,8 +207,8 @@ def test_an_unknown_walk_gets_a_usual_value_and_says_so_an_unknown_density_stays
 
 
 @pytest.mark.parametrize("rate_hz", [150.0, 400.0])
-def test_noise_is_measured_under_a_hand_s_motion(rng, rate_hz):
-    """White noise on turns of up to 2 rad/s at 3 Hz is found to a tenth, whatever the rate."""
+def test_noise_is_measured_during_hand_motion(rng, rate_hz):
+    """White noise on rotations of up to 2 rad/s at 3 Hz is measured within 10 % at any sample rate."""
     time_s = np.arange(int(30 * rate_hz)) / rate_hz
     swing = np.exp(-((time_s - 11) ** 2) / 50)[:, None] * np.sin(2 * np.pi * 3 * time_s[:, None] + [0.0, 1.0, 2.0])
     gyro = 2 * swing + rng.normal(0, 0.003, swing.shape)
@@ -219,8 +219,8 @@ def test_noise_is_measured_under_a_hand_s_motion(rng, rate_hz):
     assert found.accel_density == pytest.approx(0.04 / np.sqrt(rate_hz), rel=0.1)
 
 
-def test_noise_of_what_is_not_there_is_unknown(rng):
-    """Too few samples give nothing; without accelerometer its density is unknown."""
+def test_unmeasurable_noise_is_unknown(rng):
+    """Too few samples give no result; without accelerometer its density is unknown."""
     time_s = np.arange(400) / 200
     gyro = rng.normal(0, 0.01, (400, 3))
     assert measure_imu_noise(time_s[:20], gyro[:20], gyro[:20]) is None

@@ -1,4 +1,4 @@
-"""The camera profile: what is written is read back, what is wrong is refused in one line that says what to do."""
+"""The camera profile: a written profile reads back the same; an invalid one is rejected in one line with a hint."""
 
 from __future__ import annotations
 
@@ -101,11 +101,11 @@ def _read(folder: Path, text: str | bytes) -> CameraProfile:
     return read_profile(path)
 
 
-# ── what is read ─────────────────────────────────────────────────────────────────────────────────────────────────
+# ── reading ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_the_contracts_example_is_read_literally(tmp_path: Path) -> None:
-    """The profile that the documentation shows parses, and every value lands where it belongs."""
+def test_the_documented_example_is_read_literally(tmp_path: Path) -> None:
+    """The profile of the documentation parses, and every value is assigned correctly."""
     profile = _read(tmp_path, CONTRACT_EXAMPLE)
     assert profile == CameraProfile(
         width=720,
@@ -122,14 +122,14 @@ def test_the_contracts_example_is_read_literally(tmp_path: Path) -> None:
 
 
 def test_a_full_profile_survives_its_file(tmp_path: Path) -> None:
-    """Writing a profile with every key set and reading it again gives the same profile, and leaves no part file."""
+    """Writing and reading a profile with every key set gives the same profile and leaves no partial file."""
     write_profile(FULL, tmp_path / "full.yaml")
     assert read_profile(tmp_path / "full.yaml") == FULL
     assert [p.name for p in tmp_path.iterdir()] == ["full.yaml"]
 
 
 def test_an_empty_profile_survives_its_file() -> None:
-    """What is unknown stays unknown."""
+    """Unknown values stay unknown."""
     empty = CameraProfile(64, 48, readout_known=False)
     assert parse_profile(yaml.safe_load(format_profile(empty))) == replace(empty, shutter=Shutter(0.0, "top_to_bottom"))
 
@@ -176,12 +176,12 @@ def _profiles(draw: st.DrawFn) -> CameraProfile:
 @settings(max_examples=40, deadline=None)
 @given(profile=_profiles())
 def test_any_profile_survives_its_text(profile: CameraProfile) -> None:
-    """Whatever the values, the YAML text gives them back exactly."""
+    """The YAML text reproduces all values exactly."""
     assert parse_profile(yaml.safe_load(format_profile(profile))) == profile
 
 
 def test_any_rotation_survives_its_text() -> None:
-    """A rotation that lies along no axis comes back to the last digits, and a second reading changes nothing."""
+    """A rotation along no axis is reproduced to the last digits and stays orthogonal."""
     matrix = Rotation.from_rotvec([0.4, -1.3, 2.1]).as_matrix()
     profile = replace(FULL, r_cam_imu=tuple(map(tuple, matrix.tolist())))
     once = parse_profile(yaml.safe_load(format_profile(profile)))
@@ -198,8 +198,8 @@ def test_a_rounded_rotation_is_made_orthogonal() -> None:
     np.testing.assert_allclose(found, matrix, atol=1e-4)
 
 
-def test_numbers_of_other_dialects_are_numbers() -> None:
-    """YAML 1.1 takes 1e-3 for text; here it is a number, as JSON and people have it."""
+def test_numbers_in_other_notations_are_numbers() -> None:
+    """YAML 1.1 reads 1e-3 as text; here it is a number, as in JSON."""
     profile = _parse("shutter: {readout_time_s: 1e-3}\nintrinsics: {fx_px: 1E3, cy_px: -2e+1}\n")
     assert profile.shutter.readout_time_s == 0.001
     assert profile.intrinsics is not None
@@ -207,15 +207,15 @@ def test_numbers_of_other_dialects_are_numbers() -> None:
 
 
 @pytest.mark.parametrize("word", ["inf", ".inf", "Infinity"])
-def test_an_infinite_depth_is_rotation_only(word: str) -> None:
-    """Depth alone may be infinite, in YAML's spelling and in the contract's, and it is written as inf."""
+def test_an_infinite_depth_is_accepted(word: str) -> None:
+    """Only the depth may be infinite, in YAML's spelling and in ours, and it is written as "inf"."""
     profile = _parse(f"scene: {{depth_m: {word}}}\n")
     assert profile.depth_m == math.inf
     assert profile_mapping(profile)["scene"] == {"depth_m": "inf"}
 
 
 def test_null_is_unknown() -> None:
-    """Values that are null are unknown: a readout that counts as none, an offset, a curve, a lens, a depth."""
+    """A null readout, offset, curve, lens or depth is unknown; the readout time is then 0."""
     profile = _parse(
         "intrinsics: {fx_px: null, fy_px: null}\nshutter: {readout_time_s: null}\n"
         "imu: {T_cam_imu: null, time_offset_s: null}\nresponse: null\nscene: {depth_m: null}\n"
@@ -241,14 +241,14 @@ def test_null_is_unknown() -> None:
         "extensions: {focal_drift: null, stabilisation: {fraction: null}, response_gamma: null, gain: null}",
     ],
 )
-def test_a_null_that_cannot_be_estimated_is_as_if_left_out(text: str) -> None:
-    """A block or a value that is null has the default, as one that is not written at all."""
+def test_a_null_that_cannot_be_estimated_gives_the_default(text: str) -> None:
+    """A null block or value equals one that is left out."""
     assert _parse(text + "\n") == _parse("")
 
 
 @pytest.mark.parametrize("text", ["scene: {dept_m: null}", "extensions: {gain: [1.0, null]}", "response: {kind: null}"])
-def test_a_null_is_no_excuse(text: str) -> None:
-    """An unknown key, an element of a list and what a block cannot do without are refused, null or not."""
+def test_null_does_not_hide_an_error(text: str) -> None:
+    """Unknown keys, null elements of a list and null for a required key are rejected."""
     with pytest.raises(SettingsError):
         _parse(text + "\n")
 
@@ -263,20 +263,20 @@ def test_a_null_is_no_excuse(text: str) -> None:
     ],
 )
 def test_numbers_that_overflow_are_refused(text: str) -> None:
-    """Not a fault in the middle of a frame, nor an array without end."""
+    """They would otherwise fail during restoration or allocate huge arrays."""
     with pytest.raises(SettingsError):
         _parse(text + "\n")
 
 
-def test_what_is_left_out_has_its_default() -> None:
-    """One focal length serves both axes, the lens looks through the picture's middle, Android holds its axes."""
+def test_omitted_values_have_defaults() -> None:
+    """One focal length holds for both axes, the principal point is the centre, and the axes are Android's."""
     profile = _parse("intrinsics: {fy_px: 70}\n")
     assert profile.intrinsics == Intrinsics(64, 48, 70.0, 70.0, 31.5, 23.5)
     np.testing.assert_array_equal(profile.rotation_cam_imu, np.diag([1, -1, -1]))
 
 
 def test_focal_length_from_the_sensor_by_hand() -> None:
-    """Eq 17: 4 mm of focal length on a sensor of 6.4 mm x 4.0 mm are 40 px and 48 px at 64 x 48 px."""
+    """Eq 17: a focal length of 4 mm with a sensor of 6.4 mm × 4.0 mm gives 40 px and 48 px for 64 × 48 px."""
     lens = _parse("sensor: {width_mm: 6.4, height_mm: 4.0, focal_length_mm: 4}\n").intrinsics
     assert lens is not None
     assert (lens.fx_px, lens.fy_px) == (pytest.approx(40.0), pytest.approx(48.0))
@@ -285,20 +285,20 @@ def test_focal_length_from_the_sensor_by_hand() -> None:
     assert (square.fx_px, square.fy_px) == (pytest.approx(48.0), pytest.approx(48.0))
 
 
-def test_curve_extensions_reach_an_unknown_curve() -> None:
-    """A black level without a response stands on the default, sRGB."""
+def test_curve_extensions_apply_to_the_default_curve() -> None:
+    """A black level without a response curve applies to the default, sRGB."""
     profile = _parse("extensions: {black_level: 0.1, response_gamma: 1.2}\n")
     assert profile.response == ResponseCurve("srgb", extra_gamma=1.2, black_level=0.1)
 
 
 def test_imu_time_is_skewed_then_shifted() -> None:
-    """t_imu = t_cam (1 + clock_skew) + time_offset_s, by hand: 10 s · 1.001 − 0.25 s."""
+    """t_imu = t_cam (1 + clock_skew) + time_offset_s; computed by hand: 10 s · 1.001 − 0.25 s."""
     profile = CameraProfile(64, 48, clock_skew=1e-3, time_offset_s=-0.25)
     assert profile.imu_time_s(10.0) == pytest.approx(9.76)
 
 
-def test_an_estimate_changes_the_value_and_says_whence() -> None:
-    """A fitted value travels with its deviation and source, beside those that were there."""
+def test_an_estimate_changes_the_value_and_records_its_source() -> None:
+    """A fitted value is added with deviation and source; the original profile is unchanged."""
     changed = FULL.with_estimate("clock_skew", 2e-5, 1e-6, "fit", clock_skew=2e-5)
     assert changed.clock_skew == 2e-5
     assert changed.estimates["clock_skew"] == Estimate(2e-5, 1e-6, "fit")
@@ -306,7 +306,7 @@ def test_an_estimate_changes_the_value_and_says_whence() -> None:
     assert "clock_skew" not in FULL.estimates
 
 
-# ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────
+# ── rejecting ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize(
@@ -323,16 +323,16 @@ def test_an_estimate_changes_the_value_and_says_whence() -> None:
         ("estimates: {fx_px: {value: 1, sdt: 2}}", "estimates.fx_px.sdt", "std"),
     ],
 )
-def test_an_unknown_key_names_its_nearest_neighbour(text: str, key: str, nearest: str) -> None:
-    """A misspelt key is refused with its place and the key that was probably meant."""
+def test_the_error_for_an_unknown_key_suggests_the_nearest(text: str, key: str, nearest: str) -> None:
+    """The error for a misspelt key names its path and the likely key."""
     with pytest.raises(SettingsError) as caught:
         _parse(text)
     assert f"unknown key '{key}'" in str(caught.value)
     assert f"did you mean '{nearest}" in str(caught.value)
 
 
-def test_a_key_like_no_other_lists_the_known_ones() -> None:
-    """Where nothing is near, the keys of that place are listed."""
+def test_the_error_for_an_unrelated_key_lists_the_known_ones() -> None:
+    """Without a similar key, the error lists the keys of that block."""
     with pytest.raises(SettingsError, match="known keys: depth_m"):
         _parse("scene: {zzzzzz: 1}")
 
@@ -386,7 +386,7 @@ WRONG = {
 
 @pytest.mark.parametrize("text", [pytest.param(text, id=name) for name, text in WRONG.items()])
 def test_wrong_values_are_refused_in_one_line(text: str, tmp_path: Path) -> None:
-    """A value of the wrong kind, shape or range is a settings error of one line that names the file."""
+    """A value of the wrong type, shape or range is a settings error of one line that names the file."""
     base = "\n".join(line for line in SMALL.splitlines() if line.split(":")[0] != text.split(":")[0])
     with pytest.raises(SettingsError) as caught:
         _read(tmp_path, f"{base}\n{text}\n")
@@ -416,22 +416,22 @@ def test_wrong_values_are_refused_in_one_line(text: str, tmp_path: Path) -> None
         pytest.param(SMALL + "x: " + "{a: " * 2000 + "1" + "}" * 2000, id="deep"),
     ],
 )
-def test_what_is_no_plain_profile_is_refused(content: str | bytes, tmp_path: Path) -> None:
-    """Empty, binary, cut and clever files end in one line, never in a traceback."""
+def test_a_file_that_is_not_a_plain_profile_is_refused(content: str | bytes, tmp_path: Path) -> None:
+    """Empty, binary, truncated and hostile files give one line and no traceback."""
     with pytest.raises(SettingsError, match=r"camera\.yaml") as caught:
         _read(tmp_path, content)
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_a_bomb_of_aliases_does_not_go_off(tmp_path: Path) -> None:
-    """Ten levels of ten aliases would be ten thousand million values; the first alias is refused."""
+def test_a_yaml_bomb_is_refused(tmp_path: Path) -> None:
+    """Ten levels of ten aliases would give 10¹⁰ values; the first alias is rejected."""
     levels = ["a0: &a0 [x]"] + [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 11)]
     with pytest.raises(SettingsError, match="aliases"):
         _read(tmp_path, "\n".join(levels))
 
 
 def test_files_that_are_too_large_missing_or_folders_are_refused(tmp_path: Path) -> None:
-    """The path and the reason are in the message."""
+    """The message names the path and the reason."""
     (tmp_path / "large.yaml").write_bytes(b"#" * 1_000_001)
     with pytest.raises(SettingsError, match=r"large\.yaml: 1000001 bytes"):
         read_profile(tmp_path / "large.yaml")
@@ -442,8 +442,8 @@ def test_files_that_are_too_large_missing_or_folders_are_refused(tmp_path: Path)
 
 
 @pytest.mark.parametrize("twice", ["device: a\ndevice: b\n", "imu: {clock_skew: 0.0, clock_skew: 0.001}\n"])
-def test_a_key_that_stands_twice_is_refused(tmp_path: Path, twice: str) -> None:
-    """Two blocks of one name are a slip: neither is taken in silence."""
+def test_a_repeated_key_is_refused(tmp_path: Path, twice: str) -> None:
+    """A repeated block is a mistake; neither copy is used silently."""
     path = tmp_path / "camera.yaml"
     path.write_text("virest_profile: 1\nimage: {width: 64, height: 48}\n" + twice)
     with pytest.raises(SettingsError, match=r"camera\.yaml: line \d: '(device|clock_skew)' is written a second time"):
@@ -451,14 +451,14 @@ def test_a_key_that_stands_twice_is_refused(tmp_path: Path, twice: str) -> None:
 
 
 def test_reading_does_not_change_the_mapping() -> None:
-    """The caller's mapping stays as it was."""
+    """The caller's mapping stays unchanged."""
     content: dict[str, Any] = yaml.safe_load(CONTRACT_EXAMPLE)
     parse_profile(content)
     assert content == yaml.safe_load(CONTRACT_EXAMPLE)
 
 
 def test_centre_and_distortion_stay_while_the_focal_length_is_unknown():
-    """A null fx forgets neither cx, cy nor the distortion: the focal length found later joins them."""
+    """A null fx keeps cx, cy and the distortion, which a focal length estimated later uses."""
     lens = {"fx_px": None, "fy_px": None, "cx_px": 301.0, "cy_px": 250.5, "distortion": {"model": "radtan", "k1": -0.1}}
     profile = parse_profile({"virest_profile": 1, "image": {"width": 640, "height": 480}, "intrinsics": lens})
     assert profile.intrinsics is None
@@ -471,7 +471,7 @@ def test_centre_and_distortion_stay_while_the_focal_length_is_unknown():
 
 
 def test_a_file_with_opencvs_first_line_is_read(tmp_path: Path):
-    """OpenCV writes ``%YAML:1.0``, which is no directive of YAML; lines keep their numbers in messages."""
+    """OpenCV writes ``%YAML:1.0``, which is not valid YAML; line numbers in messages stay right."""
     path = tmp_path / "camera.yaml"
     path.write_text("%YAML:1.0\n---\nvirest_profile: 1\nimage: {width: 640, height: 480}\n")
     assert read_profile(path).width == 640

@@ -1,4 +1,4 @@
-"""Times counted anew mean the same instants."""
+"""Changing the time origin or clock of a profile keeps its values at each instant."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ RAY = np.array([0.4, 0.2, 1.0])
 
 
 def seen_px(profile: CameraProfile, imu_time_s: float) -> np.ndarray:
-    """Where a ray is seen at a time of the log."""
+    """Projection of a ray at an IMU time."""
     return moving_lens(integrate_gyro(STILL, profile), profile).project(RAY, np.array(imu_time_s))
 
 
-def test_from_a_later_stamp() -> None:
-    """Clock, lens and stretches are those of the same instants, and belong to the capture that begins there."""
+def test_a_profile_counted_from_a_later_timestamp() -> None:
+    """Clock, lens and untrusted intervals stay at the same instants and belong to the capture that begins there."""
     later = counted_from(PROFILE, 0.7, 9_000)
     for time_s in (0.8, 1.3, 1.9):
         np.testing.assert_allclose(later.imu_time_s(time_s - 0.7), PROFILE.imu_time_s(time_s) - 0.7, atol=1e-12)
@@ -44,8 +44,8 @@ def test_from_a_later_stamp() -> None:
     assert later.imu_untrusted_stamp_0_ns == 9_000
 
 
-def test_on_the_camera_s_clock() -> None:
-    """A log whose times are the camera's needs neither offset nor skew nor delay, and sees the lens as before."""
+def test_a_profile_on_the_camera_s_clock() -> None:
+    """A log on the camera's clock needs no offset, skew or delay, and the lens stays the same."""
     changed = on_camera_clock(PROFILE)
     assert (changed.time_offset_s, changed.clock_skew) == (0.0, 0.0)
     assert [field.covariates for field in changed.fields] == [("row",), ("time",)]
@@ -57,7 +57,7 @@ def test_on_the_camera_s_clock() -> None:
 
 
 def test_an_unknown_offset_stays_unknown() -> None:
-    """It counts as nought in both."""
+    """Changing the origin or the clock does not define it."""
     unknown = replace(PROFILE, time_offset_s=None)
     assert on_camera_clock(unknown).time_offset_s is None
     assert counted_from(unknown, 0.5, None).time_offset_s is None

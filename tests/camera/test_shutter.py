@@ -1,4 +1,4 @@
-"""The shutter: rows in time, against numbers worked out by hand (forward_model, section 1)."""
+"""The shutter: row times, compared with hand calculations (forward_model, section 1)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from virest.errors import SettingsError
 
 WIDTH, HEIGHT = 10, 4
 TABLE = {
-    # pixel (3, 1) of a picture 10 wide and 4 high, and the first and last row or column read
+    # pixel (3, 1) of a frame of 10 × 4 pixels, the first and the last row or column read, and the fraction of the last
     "top_to_bottom": (0.25, (5, 0), (5, 3), 0.75),
     "bottom_to_top": (0.5, (5, 3), (5, 0), 0.75),
     "left_to_right": (0.3, (0, 2), (9, 2), 0.9),
@@ -23,8 +23,8 @@ def _fraction(direction: str, point: tuple[float, float]) -> float:
 
 
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
-def test_readout_fractions_worked_by_hand(direction: str) -> None:
-    """A pixel's part of the readout is the formulas': 0 for the first row read, one row short of 1 for the last."""
+def test_readout_fractions_match_a_hand_calculation(direction: str) -> None:
+    """The fraction is 0 for the first row read and one row below 1 for the last."""
     inside, first, last, at_last = TABLE[direction]
     assert _fraction(direction, (3, 1)) == pytest.approx(inside)
     assert _fraction(direction, first) == pytest.approx(0.0)
@@ -32,8 +32,8 @@ def test_readout_fractions_worked_by_hand(direction: str) -> None:
 
 
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
-def test_fractions_go_on_outside_the_picture(direction: str) -> None:
-    """Points outside the picture are not clipped, and half pixels lie between whole ones."""
+def test_fractions_continue_outside_the_frame(direction: str) -> None:
+    """Points outside the frame are not clipped, and subpixel positions are interpolated."""
     far = {"top_to_bottom": (2.0, 5.0, 1.25), "bottom_to_top": (2.0, 5.0, -0.5)}
     far |= {"left_to_right": (-2.0, 1.0, -0.2), "right_to_left": (-2.0, 1.0, 1.1)}
     x, y, expected = far[direction]
@@ -43,12 +43,12 @@ def test_fractions_go_on_outside_the_picture(direction: str) -> None:
 
 
 def test_fractions_keep_the_shape_of_the_points() -> None:
-    """A field of points (..., 2) gives a field of fractions (...)."""
+    """An array of points (..., 2) gives an array of fractions (...)."""
     points = np.random.default_rng(0).uniform(0, 4, (3, 5, 2))
     assert Shutter(0.02, "bottom_to_top").readout_fraction(points, WIDTH, HEIGHT).shape == (3, 5)
 
 
-def test_columns_are_read_by_the_sideways_directions_only() -> None:
+def test_only_sideways_directions_read_columns() -> None:
     """A sideways readout runs along x."""
     assert [Shutter(0, d).reads_columns for d in READOUT_DIRECTIONS] == [False, False, True, True]
 
@@ -56,20 +56,20 @@ def test_columns_are_read_by_the_sideways_directions_only() -> None:
 @pytest.mark.parametrize(
     ("timestamp", "start_s"), [("exposure_start", 5.0), ("exposure_middle", 4.988), ("exposure_end", 4.976)]
 )
-def test_stamps_lie_where_the_profile_says(timestamp: str, start_s: float) -> None:
-    """From a stamp, the first row starts 0, half or one *true* exposure earlier: 0.020 s logged x 1.2 = 0.024 s."""
+def test_timestamps_refer_to_the_point_in_the_profile(timestamp: str, start_s: float) -> None:
+    """The first row starts 0, half or one *true* exposure before the timestamp: 0.020 s logged × 1.2 = 0.024 s."""
     shutter = Shutter(0.03, "left_to_right", timestamp, exposure_scale=1.2)
     assert shutter.true_exposure_s(0.020) == pytest.approx(0.024)
     assert shutter.first_row_start_s(5.0, 0.020) == pytest.approx(start_s, abs=1e-12)
 
 
-def test_stamp_meanings_are_the_contracts() -> None:
-    """There are three meanings of a stamp."""
+def test_timestamp_references_are_as_documented() -> None:
+    """A timestamp has three possible references."""
     assert STAMP_FRACTION == {"exposure_start": 0.0, "exposure_middle": 0.5, "exposure_end": 1.0}
 
 
 def test_unknown_words_are_refused() -> None:
-    """A direction or a stamp that is not known is a settings error that repeats the word."""
+    """An unknown direction or timestamp reference is a settings error that repeats the word."""
     with pytest.raises(SettingsError, match="sideways"):
         Shutter(0.02, "sideways")
     with pytest.raises(SettingsError, match="exposure_begin"):

@@ -19,7 +19,7 @@ METADATA_11 = (
 
 
 def write_movie(path: Path, pictures: list[np.ndarray], pts_ns: list[int], **options: str) -> None:
-    """An H.264 movie of grey pictures (h, w) with exact PTS on a 90 kHz clock."""
+    """An H.264 movie of grey frames (h, w) with exact PTS on a 90 kHz clock."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=30)
         stream.height, stream.width = pictures[0].shape
@@ -34,7 +34,7 @@ def write_movie(path: Path, pictures: list[np.ndarray], pts_ns: list[int], **opt
 
 
 def moving_pictures(count: int, repeats: tuple[int, ...] = (), width: int = 64, height: int = 96) -> list[np.ndarray]:
-    """A texture that moves 3 px a picture; those in ``repeats`` are their predecessors again."""
+    """A texture that moves 3 px per frame; frames in ``repeats`` repeat their predecessors."""
     scene = np.random.default_rng(5).integers(40, 216, (height, width + 4 * count), dtype=np.uint8)
     pictures: list[np.ndarray] = []
     for i in range(count):
@@ -44,7 +44,7 @@ def moving_pictures(count: int, repeats: tuple[int, ...] = (), width: int = 64, 
 
 @dataclass
 class CaptureWriter:
-    """A capture to be written, whose parts a test can spoil first."""
+    """A capture to be written; a test can damage its parts first."""
 
     folder: Path
     count: int = 30
@@ -61,7 +61,7 @@ class CaptureWriter:
 
     def __post_init__(self) -> None:
         self.folder.mkdir(exist_ok=True)
-        # one long step, so that sliding has one answer
+        # one long step makes the alignment unique
         steps = [i * PERIOD_NS + (17_000_000 if i > 7 else 0) for i in range(self.count)]
         self.stamps_ns = [START_NS + step for step in steps]
         self.metadata_ns = [stamp + 437 for stamp in self.stamps_ns]

@@ -10,5 +10,5 @@ from capture_writing import CaptureWriter
 
 @pytest.fixture
 def writer(tmp_path: Path) -> CaptureWriter:
-    """A sound capture of 30 frames, 64x96, not yet written."""
+    """An intact capture of 30 frames, 64 × 96, not yet written."""
     return CaptureWriter(tmp_path / "2022_09_17_10_00_00")

@@ -1,4 +1,4 @@
-"""Write tiny recordings of other kinds than MARSLogger's on Android, with known content."""
+"""Write tiny recordings in formats other than MARSLogger for Android, with known content."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def colour_pictures(count: int, width: int = 96, height: int = 64) -> list[np.nd
 
 
 def stamps(count: int) -> list[int]:
-    """Uneven steps, so that a shift by a frame would show."""
+    """Timestamps with uneven steps, so that a shift by a frame would show."""
     return [T0_NS + i * PERIOD_NS + (1_234_567 if i > 2 else 0) for i in range(count)]
 
 
 def imu_rows(first_ns: int, last_ns: int) -> list[tuple[int, list[float]]]:
-    """Six columns that all differ, 100 ms more than the frames on both sides."""
+    """Six columns with different values, reaching at least 100 ms beyond the frames on both sides."""
     times = range(first_ns - 100_000_000, last_ns + 150_000_000, IMU_PERIOD_NS)
     return [(t, [0.1 + 1e-3 * k, -0.25, 0.75, 0.3, 9.7, -0.4]) for k, t in enumerate(times)]
 
 
 def write_euroc(root: Path, count: int = 8, camera: str = "cam0", ending: str = "\r\n") -> list[np.ndarray]:
-    """A sequence of one camera, line ends as in the original data set; returns its pictures, RGB."""
+    """A sequence of one camera with the line ends of the original data set; returns its pictures, RGB."""
     pictures, times = colour_pictures(count), stamps(count)
     folder = root / "mav0" / camera
     (folder / "data").mkdir(parents=True)
@@ -71,7 +71,7 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
 
 
 def write_film(path: Path, count: int, first_ns: int = 0, width: int = 96, height: int = 64) -> list[int]:
-    """A movie of uneven steps; returns its times, ns."""
+    """A movie with uneven steps; returns its times in ns."""
     steps = [i * 33_400_000 + (17_000_000 if i > 7 else 0) for i in range(count)]
     write_movie(path, moving_pictures(count, (), width, height), steps)
     return [first_ns + step for step in steps]

@@ -1,4 +1,4 @@
-"""The step that decoders tell is the one that the coder was given."""
+"""Decoders report the quantisation step that the encoder used."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from virest.capture.video import probe_movie, read_gray
 
 
 def _steps(path: Path, codec: str, options: dict[str, str]) -> tuple[dict[int, float], float]:
-    """What is told of three frames of a texture, and the mean square that coding changed in the first."""
+    """Steps reported for three frames of a texture, and the mean squared coding error of the first."""
     pictures = [np.rint(255 * texture(96, 128, seed)).astype(np.uint8) for seed in range(3)]
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream(codec, rate=30)
@@ -34,25 +34,27 @@ def _steps(path: Path, codec: str, options: dict[str, str]) -> tuple[dict[int, f
 @pytest.mark.parametrize(
     ("codec", "options", "step"),
     [
-        ("libx264", {"qp": "30", "aq-mode": "0"}, 0.625 * 2 ** (27 / 6)),  # x264 codes key frames by 3 finer
-        ("libvpx-vp9", {"qmin": "40", "qmax": "40", "b": "0", "crf": "40"}, 305 / 8),  # its index 160
+        ("libx264", {"qp": "30", "aq-mode": "0"}, 0.625 * 2 ** (27 / 6)),  # x264 codes key frames with a QP lower by 3
+        ("libvpx-vp9", {"qmin": "40", "qmax": "40", "b": "0", "crf": "40"}, 305 / 8),  # index 160 of VP9's table
     ],
 )
-def test_a_decoder_tells_the_step(tmp_path: Path, codec: str, options: dict[str, str], step: float) -> None:
-    """And the error of a textured key frame is a step's: Δ² / 3 where a dead zone of Δ drops all, or less."""
+def test_a_decoder_reports_the_quantisation_step(
+    tmp_path: Path, codec: str, options: dict[str, str], step: float
+) -> None:
+    """The error of a textured key frame matches the step Δ: at most Δ² / 3, where a dead zone of Δ drops everything."""
     told, error = _steps(tmp_path / "coded.mp4", codec, options)
     assert len(told) == 3
     assert told[0] == pytest.approx(step, rel=0.05)
     assert 0.3 / 12 < error / told[0] ** 2 < 1 / 3
 
 
-def test_what_no_decoder_tells_is_missing(tmp_path: Path) -> None:
-    """FFmpeg does not tell the step of HEVC."""
+def test_an_unreported_step_is_missing(tmp_path: Path) -> None:
+    """FFmpeg does not report the step of HEVC."""
     told, _ = _steps(tmp_path / "coded.mp4", "libx265", {"x265-params": "log-level=none"})
     assert not told
 
 
-def test_vp9s_steps_are_those_of_its_specification() -> None:
-    """Some of the 256 values."""
+def test_vp9_steps_match_the_specification() -> None:
+    """Several of the 256 values are compared."""
     assert len(VP9_STEPS) == 256
     assert [8 * VP9_STEPS[i] for i in (0, 1, 95, 120, 150, 200, 255)] == [4, 8, 102, 152, 255, 639, 1828]

@@ -1,4 +1,4 @@
-"""EuRoC / ASL folders: where they are told, what is read of them, and what is refused."""
+"""EuRoC / ASL folders: finding, reading and rejecting them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from virest.errors import CaptureError, ClockError, ImuError, VideoError
 
 @pytest.fixture
 def sequence(tmp_path: Path) -> Path:
-    """A sequence of eight pictures, 96x64."""
+    """A sequence of eight pictures, 96 × 64."""
     write_euroc(tmp_path / "V1_01")
     return tmp_path / "V1_01"
 
@@ -28,8 +28,8 @@ def codes(capture: Capture) -> set[str]:
     return {note.code for note in capture.notes}
 
 
-def test_a_sequence_is_read_whole(tmp_path):
-    """Stamps, samples in their order, and pixels are those that were written."""
+def test_a_sequence_is_read_completely(tmp_path):
+    """Timestamps, order of samples and pixels are as written."""
     pictures = write_euroc(tmp_path / "V1_01")
     capture = read_capture(tmp_path / "V1_01")
     assert (capture.kind, capture.name, capture.width, capture.height) == ("EuRoC", "V1_01", 96, 64)
@@ -47,7 +47,7 @@ def test_a_sequence_is_read_whole(tmp_path):
 
 
 def test_the_profile_comes_from_sensor_yaml(sequence):
-    """Lens and both poses are taken: x_cam = inv(T_BC) T_BI x_imu; readout and offset stay unknown."""
+    """Lens and both poses are used: x_cam = inv(T_BC) T_BI x_imu; readout time and offset stay unknown."""
     capture = read_capture(sequence)
     profile, source = resolve_profile(capture)
     assert "metadata" in source
@@ -56,7 +56,7 @@ def test_the_profile_comes_from_sensor_yaml(sequence):
     assert profile.intrinsics.coefficients == (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0)
     assert not profile.readout_known
     assert profile.time_offset_s is None
-    # the body's x axis is the camera's −y; and the sensor's y axis, turned by a right angle, is the body's −x
+    # the body's x axis is the camera's −y axis; the sensor's y axis is the body's −x axis
     np.testing.assert_allclose(profile.rotation_cam_imu @ [0, -1, 0], [0.0149, -0.9999, 0.0041], atol=1e-4)
     body_from_cam = np.array([-0.0216401454975, -0.064676986768, 0.00981073058949])
     rotation = profile.rotation_cam_imu @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
@@ -64,8 +64,11 @@ def test_the_profile_comes_from_sensor_yaml(sequence):
 
 
 @pytest.mark.parametrize("part", ["", "mav0", "mav0/cam1"])
-def test_a_path_says_which_camera(tmp_path, part):
-    """The sequence and its mav0 mean the first camera, a camera's folder that one with its own shutter."""
+def test_the_path_selects_the_camera(tmp_path, part):
+    """The sequence and its mav0 folder select the first camera.
+
+    A camera's folder selects that camera with its own shutter.
+    """
     write_euroc(tmp_path / "seq", 4)
     pictures = write_euroc(tmp_path / "seq", 6, "cam1")
     with (tmp_path / "seq/mav0/cam1/sensor.yaml").open("a") as file:
@@ -78,8 +81,8 @@ def test_a_path_says_which_camera(tmp_path, part):
     assert profile.shutter.readout_time_s == pytest.approx(64 * 29473.7e-9 if part.endswith("cam1") else 0.0)
 
 
-def test_exposures_of_tum_vi_join_by_time(sequence):
-    """dso/cam0/times.txt gives exposures in milliseconds, whatever order or holes it has."""
+def test_exposures_of_tum_vi_are_joined_by_time(sequence):
+    """dso/cam0/times.txt gives exposures in milliseconds; a missing row is interpolated."""
     times = [f"{t} {t // 10**9}.{t % 10**9:09d} {0.5 + k}" for k, t in enumerate(stamps(8)) if k != 4]
     (sequence / "dso/cam0").mkdir(parents=True)
     (sequence / "dso/cam0/times.txt").write_text("\n".join(["# id time exposure", *times]) + "\n")
@@ -89,8 +92,8 @@ def test_exposures_of_tum_vi_join_by_time(sequence):
     assert "exposure-interpolated" in {note.code for note in capture.notes}
 
 
-def test_without_sensor_yaml_a_camera_chain_serves(sequence):
-    """Kalibr's chain beside the sequence is used for the camera of its name, with its line delay."""
+def test_without_sensor_yaml_a_camera_chain_is_used(sequence):
+    """Kalibr's chain beside the sequence supplies the camera of the same name."""
     (sequence / "mav0/cam0/sensor.yaml").unlink()
     assert "axes-unknown" in codes(read_capture(sequence))
     chain = (
@@ -105,8 +108,8 @@ def test_without_sensor_yaml_a_camera_chain_serves(sequence):
     assert (profile.intrinsics.model, profile.intrinsics.fy_px, profile.time_offset_s) == ("fisheye", 71.0, 0.004)
 
 
-def test_sixteen_bits_and_grey_are_read(tmp_path):
-    """Pictures of 16 bits are rounded to 8, grey ones have three equal channels."""
+def test_16_bit_and_grey_pictures_are_read(tmp_path):
+    """16-bit pictures are rounded to 8 bits; grey ones have three equal channels."""
     write_euroc(tmp_path / "seq", 3)
     folder = tmp_path / "seq/mav0/cam0/data"
     deep = (np.arange(96 * 64, dtype=np.float64) * 10.6).astype(np.uint16).reshape(64, 96)
@@ -119,7 +122,7 @@ def test_sixteen_bits_and_grey_are_read(tmp_path):
 
 
 def test_missing_and_broken_pictures_are_counted_or_none(sequence):
-    """A listed picture that is not there is dropped and counted; one that is cut, or of another size, is None."""
+    """A missing listed picture is dropped and counted; a truncated one, or one of another size, is None."""
     data = sequence / "mav0/cam0/data"
     names = sorted(data.iterdir())
     names[2].unlink()
@@ -136,7 +139,7 @@ def test_missing_and_broken_pictures_are_counted_or_none(sequence):
     "name", ["../../../secret.png", "/etc/secret.png", "..\\secret.png", "C:/secret.png", "a/../../b.png"]
 )
 def test_names_never_lead_out_of_the_folder(sequence, name):
-    """A list that names a picture elsewhere is refused, and what it names is not opened."""
+    """A list that names a picture outside the folder is rejected."""
     (sequence.parent / "secret.png").write_bytes(b"secret")
     path = sequence / "mav0/cam0/data.csv"
     path.write_text(path.read_text() + f"{stamps(9)[-1]},{name}\n")
@@ -158,8 +161,8 @@ def test_names_never_lead_out_of_the_folder(sequence, name):
         ("mav0/cam0/sensor.yaml", "resolution: 5\n", CaptureError, "resolution"),
     ],
 )  # fmt: skip
-def test_bad_files_end_in_one_line(sequence, file, content, error, words):
-    """Each fault is an error of the capture that names the file."""
+def test_bad_euroc_files_give_one_line(sequence, file, content, error, words):
+    """Each fault is a one-line error with exit code 4."""
     (sequence / file).write_text(content)
     with pytest.raises(error, match=words) as fault:
         read_capture(sequence)
@@ -168,7 +171,7 @@ def test_bad_files_end_in_one_line(sequence, file, content, error, words):
 
 
 def test_missing_parts_are_named(sequence):
-    """Without samples or pictures the part that is missing is named."""
+    """Without samples or pictures, the error names the missing part."""
     (sequence / "mav0/imu0/data.csv").rename(sequence / "samples")
     with pytest.raises(ImuError, match=r"imu0/data\.csv: no such file"):
         read_capture(sequence)
@@ -179,8 +182,8 @@ def test_missing_parts_are_named(sequence):
         read_capture(sequence)
 
 
-def test_sensor_of_another_size_is_not_used(sequence):
-    """Intrinsics of other pictures are left out with a note."""
+def test_a_sensor_yaml_of_another_size_is_not_used(sequence):
+    """Intrinsics for another picture size are left out with a note."""
     path = sequence / "mav0/cam0/sensor.yaml"
     path.write_text(path.read_text().replace("[96, 64]", "[752, 480]"))
     capture = read_capture(sequence)
@@ -189,7 +192,7 @@ def test_sensor_of_another_size_is_not_used(sequence):
 
 
 def test_orb_slam_settings_are_read_by_opencv(sequence, tmp_path):
-    """OpenCV's reader, which ORB-SLAM3 uses, finds reals as reals, whole numbers as such, and T_b_c1."""
+    """OpenCV's reader, which ORB-SLAM3 uses, finds real numbers, integers and T_b_c1."""
     profile, _ = resolve_profile(read_capture(sequence))
     path = tmp_path / "orb.yaml"
     path.write_text(format_orb_slam(profile, 20.0, ImuNoise(200.0, 1e-4, 0.01), ["a comment"]))

@@ -1,4 +1,4 @@
-"""A capture folder as a whole: joins, clocks, trimming, start-up, focal length, profiles, refusals."""
+"""A capture folder as a whole: joins, clocks, trimming, start-up, focal length, profiles and errors."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def codes(capture: Capture) -> set[str]:
 
 
 def skipped(capture: Capture) -> list[int]:
-    """Indices of frames left out."""
+    """Indices of skipped frames."""
     return [frame.index for frame in capture.frames if frame.skip_reason]
 
 
-def test_sound_capture_has_nothing_to_say(writer):
-    """Every frame joins, nothing is dropped or skipped, and no note is written."""
+def test_an_intact_capture_has_no_notes(writer):
+    """Every frame joins, and nothing is dropped or skipped."""
     capture = read_capture(writer.write())
     assert capture.notes == ()
     assert len(capture.usable) == len(capture.frames) == 30
@@ -44,7 +44,7 @@ def test_sound_capture_has_nothing_to_say(writer):
 
 
 def test_portrait_focal_lengths_are_swapped(writer):
-    """The logger's fx belongs to the sensor's long axis, which stands upright in a portrait picture."""
+    """The logger's fx belongs to the sensor's long axis, which is vertical in a portrait frame."""
     metadata = read_capture(writer.write()).metadata
     assert (metadata.fx_px, metadata.fy_px) == (81.0, 80.0)
     assert metadata.readout_time_s == pytest.approx(0.02)
@@ -54,7 +54,7 @@ def test_portrait_focal_lengths_are_swapped(writer):
 
 
 def test_metadata_join_by_time_not_by_index(writer):
-    """Spare metadata rows are left over, and frames without one take their neighbours' exposure, in either order."""
+    """Surplus metadata rows are ignored, and a frame without a row takes its neighbours' exposure."""
     writer.metadata_ns = [START_NS - 2 * PERIOD_NS, START_NS - PERIOD_NS, *writer.metadata_ns]
     del writer.metadata_ns[2 + 5]
     capture = read_capture(writer.write())
@@ -64,8 +64,8 @@ def test_metadata_join_by_time_not_by_index(writer):
     assert skipped(capture) == []
 
 
-def test_missing_stamp_row_is_found_by_sliding(writer):
-    """A lost row of stamps costs its own frame only."""
+def test_a_missing_timestamp_row_is_found_by_alignment(writer):
+    """A lost row skips only its own frame."""
     writer.write_movie()
     writer.write_metadata()
     writer.write_gyro()
@@ -78,8 +78,8 @@ def test_missing_stamp_row_is_found_by_sliding(writer):
     assert "stamps-slid" in codes(capture)
 
 
-def test_missing_first_stamp_under_even_spacing_is_decided_by_the_metadata(writer):
-    """Where two shifts fit the stamps alike, the metadata rows say which one is right."""
+def test_the_metadata_locate_a_missing_first_timestamp(writer):
+    """With even spacing two alignments fit the timestamps equally well; the metadata rows decide."""
     writer.write()
     rows = [START_NS + i * PERIOD_NS for i in range(30)]
     pts = [i * PERIOD_NS for i in range(30)]
@@ -94,8 +94,8 @@ def test_missing_first_stamp_under_even_spacing_is_decided_by_the_metadata(write
 
 
 @pytest.mark.parametrize("content", [None, "", "Frame timestamp[nanosec]\n"])
-def test_stamps_never_written_are_replaced_by_metadata(writer, content):
-    """Without a clean Stop the movie's PTS are slid over the metadata rows."""
+def test_missing_timestamps_are_replaced_by_metadata(writer, content):
+    """Without a clean stop of the recording, the movie's PTS are aligned with the metadata rows."""
     writer.metadata_ns = [START_NS - PERIOD_NS, *writer.metadata_ns, writer.metadata_ns[-1] + PERIOD_NS]
     writer.write()
     (writer.folder / "frame_timestamps.txt").unlink()
@@ -107,8 +107,8 @@ def test_stamps_never_written_are_replaced_by_metadata(writer, content):
     assert "no-stamps" in codes(capture)
 
 
-def test_stamps_of_another_movie_are_refused_with_numbers(writer):
-    """PTS and stamps that part are a clock error that says where and by how much."""
+def test_timestamps_of_another_movie_are_refused(writer):
+    """The clock error states where PTS and timestamps diverge and by how much."""
     writer.write()
     writer.stamps_ns = [START_NS + round(i * 1.05 * PERIOD_NS) for i in range(30)]
     writer.write_stamps()
@@ -117,7 +117,7 @@ def test_stamps_of_another_movie_are_refused_with_numbers(writer):
 
 
 def test_metadata_of_another_session_are_refused(writer):
-    """Not one joining metadata row means different sessions."""
+    """If no metadata row joins a frame, the files are from different sessions."""
     writer.write()
     writer.metadata_ns = [time + 10**12 for time in writer.metadata_ns]
     writer.write_metadata()
@@ -126,14 +126,14 @@ def test_metadata_of_another_session_are_refused(writer):
 
 
 def test_gyro_of_another_session_is_refused_with_both_spans(writer):
-    """Samples that share no time with the frames are refused, not extrapolated."""
+    """Samples without common time with the frames are rejected, not extrapolated."""
     writer.imu_ns = [time - 10**13 for time in writer.imu_ns]
     with pytest.raises(ClockError, match=r"gyro_accel\.csv covers 18.*frames 28670.*apart"):
         read_capture(writer.write())
 
 
 def test_unknown_clock_is_shifted_by_the_mean_of_edge_epochs(writer):
-    """Camera stamps of source UNKNOWN move to the IMU's clock; time zero moves with them."""
+    """Camera timestamps of source UNKNOWN are moved to the IMU's clock, and so is time zero."""
     shift = 22_319_000_000_000
     writer.imu_ns = [time + shift for time in writer.imu_ns]
     writer.write()
@@ -147,16 +147,16 @@ def test_unknown_clock_is_shifted_by_the_mean_of_edge_epochs(writer):
     assert len(capture.usable) == 30
 
 
-def test_realtime_clock_is_left_alone(writer):
-    """Source REALTIME needs no shift whatever the rows say."""
+def test_a_realtime_clock_is_not_shifted(writer):
+    """Source REALTIME needs no shift, whatever the rows contain."""
     writer.write()
     (writer.folder / "edge_epochs.txt").write_text(EPOCHS.format(source="REALTIME", rows="9\t1\t5000\n"))
     capture = read_capture(writer.folder)
     assert (capture.clock_source, capture.clock_shift_ns) == ("REALTIME", 0)
 
 
-def test_unknown_clock_without_rows_needs_shared_time(writer):
-    """Without a difference, stamps are used as they are only if the spans overlap."""
+def test_an_unknown_clock_without_rows_needs_overlapping_times(writer):
+    """Without a clock difference, timestamps are used unchanged only if the time spans overlap."""
     writer.write()
     (writer.folder / "edge_epochs.txt").write_text(EPOCHS.format(source="UNKNOWN", rows=""))
     assert "clock-shift" in codes(read_capture(writer.folder))
@@ -166,8 +166,8 @@ def test_unknown_clock_without_rows_needs_shared_time(writer):
         read_capture(writer.folder)
 
 
-def test_frames_outside_the_imu_are_left_out(writer):
-    """Frames count as covered with their exposure and readout, one IMU period beyond its ends."""
+def test_frames_outside_the_imu_samples_are_skipped(writer):
+    """Coverage includes exposure and readout and extends one IMU period beyond the samples."""
     first, last = writer.stamps_ns[2], writer.stamps_ns[-2] + 30_000_000
     writer.imu_ns = [time for time in writer.imu_ns if first <= time <= last]
     capture = read_capture(writer.write())
@@ -177,8 +177,8 @@ def test_frames_outside_the_imu_are_left_out(writer):
     assert capture.frames[0].time_s == 0.0
 
 
-def test_frames_in_an_imu_gap_are_left_out_and_the_gap_named(writer):
-    """A hole of the samples, or NaN rows, cost the frames that overlap it."""
+def test_frames_in_an_imu_gap_are_skipped_and_the_gap_is_named(writer):
+    """A gap in the samples skips the frames that overlap it."""
     hole = writer.stamps_ns[10] + 2_000_000, writer.stamps_ns[12]
     writer.imu_ns = [time for time in writer.imu_ns if not hole[0] < time < hole[1]]
     capture = read_capture(writer.write())
@@ -189,7 +189,7 @@ def test_frames_in_an_imu_gap_are_left_out_and_the_gap_named(writer):
 
 
 def test_imu_that_covers_no_frame_is_refused(writer):
-    """Samples inside the clock's span but in no frame leave nothing to do."""
+    """Samples within the capture's time span that cover no frame are an error."""
     end = writer.stamps_ns[-1]
     writer.imu_ns = list(range(end - 3_000_000, end + 2_000_000, 1_000_000))
     with pytest.raises(ImuError, match="none of the 30 frames"):
@@ -206,15 +206,15 @@ def test_imu_that_covers_no_frame_is_refused(writer):
         (70.0, 70.0, None),
     ],
 )
-def test_focal_length_is_judged_against_the_long_side(writer, fx, expected, code):
-    """Array pixels are refused with the fix, odd values noted, plausible ones taken."""
+def test_a_logged_focal_length_is_checked_against_the_long_side(writer, fx, expected, code):
+    """Array pixels are rejected, unusual values are noted, and plausible values are accepted."""
     writer.fx = (fx, fx)
     capture = read_capture(writer.write())
     assert capture.metadata.fx_px == expected
     assert codes(capture) == ({code} if code else set())
 
 
-def test_startup_lag_from_repeated_pictures(writer):
+def test_start_up_lag_from_repeated_frames(writer):
     """Exact repeats while the phone turns mark all frames up to the last repeat."""
     writer.repeats = (2, 5, 8)
     capture = read_capture(writer.write())
@@ -228,15 +228,15 @@ def test_startup_lag_from_repeated_pictures(writer):
 
 
 def test_repeats_of_a_still_phone_mean_nothing(writer):
-    """Without turning, equal pictures are no evidence."""
+    """Without rotation, equal frames are no evidence of a lag."""
     writer.repeats, writer.rate_rad_s = (2, 5, 8), 0.0
     capture = read_capture(writer.write())
     assert capture.repeats == ()
     assert capture.notes == ()
 
 
-def test_startup_lag_from_unix_columns_alone(writer):
-    """Encoder output that comes later than usual at first marks the frames until it has settled."""
+def test_start_up_lag_from_the_unix_columns_alone(writer):
+    """Frames that leave the encoder later than usual are marked until the delay has settled."""
     writer.write()
     lags_ms = [300, 260, 200, 160, 130, *[100] * 25]
     stamps = [
@@ -253,7 +253,7 @@ def test_startup_lag_from_unix_columns_alone(writer):
 
 
 def test_default_profile_follows_the_orientation(writer):
-    """Portrait and landscape pictures get their own axes and readout direction; the rest comes from the metadata."""
+    """Portrait and landscape frames have different axes and readout directions; other values come from the metadata."""
     profile = default_profile(read_capture(writer.write()))
     assert profile.shutter.readout_direction == "right_to_left"
     assert profile.r_cam_imu == ((1, 0, 0), (0, -1, 0), (0, 0, -1))
@@ -270,7 +270,7 @@ def test_default_profile_follows_the_orientation(writer):
 
 
 def test_profile_comes_from_config_then_folder_then_metadata(writer, tmp_path):
-    """The first that exists wins, and null values are filled from the metadata."""
+    """The first one that exists is used, and its null values are filled from the metadata."""
     capture = read_capture(writer.write())
     profile, source = resolve_profile(capture, None)
     assert "metadata" in source
@@ -287,8 +287,8 @@ def test_profile_comes_from_config_then_folder_then_metadata(writer, tmp_path):
         resolve_profile(capture, tmp_path / "mine.yaml")
 
 
-def test_a_capture_whose_clock_begins_at_its_first_frame_is_whole(writer):
-    """Stamps that count from 0 join like any others, and no frame moves by one."""
+def test_a_capture_whose_clock_starts_at_zero_is_intact(writer):
+    """Timestamps that count from 0 join like any others, and no frame shifts."""
     shift = min(writer.stamps_ns)
     for name in ("stamps_ns", "metadata_ns", "imu_ns"):
         setattr(writer, name, [time - shift for time in getattr(writer, name)])
@@ -299,8 +299,8 @@ def test_a_capture_whose_clock_begins_at_its_first_frame_is_whole(writer):
 
 
 @pytest.mark.parametrize("row", ["0.1,0.99,0.0", "0,0,0"])
-def test_an_accelerometer_without_gravity_is_doubted(writer, row):
-    """Values in g, without gravity, or of the gyroscope: said, before anything is built on them."""
+def test_an_accelerometer_without_gravity_is_noted(writer, row):
+    """Values in g or without gravity give a note."""
     writer.write()
     lines = (writer.folder / "gyro_accel.csv").read_text().splitlines()
     writer.text("gyro_accel.csv", [lines[0], *(",".join(line.split(",")[:4]) + f",{row}" for line in lines[1:])])
@@ -311,8 +311,8 @@ def test_an_accelerometer_without_gravity_is_doubted(writer, row):
     ("name", "said"),
     [("MOVIE.MOV", "'MOVIE.MOV'? rename it"), ("take.mkv", "'take.mkv'? ffmpeg"), ("a.txt", "its movie")],
 )
-def test_a_movie_of_another_name_is_pointed_at(writer, name, said):
-    """Renamed, or put into another container, by whoever copied it."""
+def test_the_error_for_a_missing_movie_suggests_a_file(writer, name, said):
+    """The movie may have been renamed or put into another container."""
     folder = writer.write()
     (folder / "movie.mp4").rename(folder / name)
     with pytest.raises(VideoError, match="no such file") as caught:
@@ -324,7 +324,7 @@ def test_a_movie_of_another_name_is_pointed_at(writer, name, said):
     ("head", "kind"), [(b"\x1a\x45\xdf\xa3", "Matroska"), (b"RIFF\0\0\0\0AVI LIST", "AVI"), (b"text", "moov")]
 )
 def test_another_container_is_named(writer, head, kind):
-    """With the command that puts its stream into an MP4."""
+    """The hint names the container or the missing part."""
     folder = writer.write()
     (folder / "movie.mp4").write_bytes(head + bytes(1000))
     with pytest.raises(VideoError, match="cannot be opened") as caught:
@@ -333,7 +333,7 @@ def test_another_container_is_named(writer, head, kind):
 
 
 def swap(writer: CaptureWriter, one: str, other: str) -> None:
-    """Exchange two files' contents."""
+    """Exchange the contents of two files."""
     left, right = writer.folder / one, writer.folder / other
     content = left.read_bytes(), right.read_bytes()
     left.write_bytes(content[1])
@@ -350,7 +350,7 @@ def swap(writer: CaptureWriter, one: str, other: str) -> None:
     ],
 )
 def test_swapped_files_are_named(writer, one, other):
-    """Two files in each other's place are told by their headers."""
+    """Two swapped files are recognised by their headers."""
     writer.write()
     swap(writer, one, other)
     with pytest.raises(CaptureError, match=f"{one}|{other}"):
@@ -361,8 +361,8 @@ def test_swapped_files_are_named(writer, one, other):
     "name", ["movie.mp4", "gyro_accel.csv", "movie_metadata.csv", "frame_timestamps.txt", "edge_epochs.txt"]
 )
 @pytest.mark.parametrize("kind", ["pipe", "folder", "loop"])
-def test_what_is_no_plain_file_is_refused_at_once(writer, name, kind):
-    """Pipes, folders and loops of links in a file's place end in one line, without hanging."""
+def test_a_special_file_is_refused_at_once(writer, name, kind):
+    """Pipes, folders and link loops in place of a file give an error without hanging."""
     writer.write()
     path = writer.folder / name
     path.unlink(missing_ok=True)
@@ -378,7 +378,7 @@ def test_what_is_no_plain_file_is_refused_at_once(writer, name, kind):
 
 
 def test_missing_files_are_named(writer, tmp_path):
-    """Each file that a capture cannot do without is named; the metadata are not among them."""
+    """Each required file is named; the metadata are optional."""
     writer.write()
     (writer.folder / "movie_metadata.csv").unlink()
     capture = read_capture(writer.folder)
@@ -400,14 +400,14 @@ def test_missing_files_are_named(writer, tmp_path):
             read_capture(place)
 
 
-def test_folder_called_dot_has_a_name(writer, monkeypatch):
-    """The current folder is known by its own name."""
+def test_the_current_folder_has_a_name(writer, monkeypatch):
+    """A capture given as ``.`` has the folder's own name."""
     monkeypatch.chdir(writer.write())
     assert read_capture(os.curdir).name == "2022_09_17_10_00_00"
 
 
-def test_honor_v10_lies_wholly_in_the_startup(realdata):
-    """All 25 frames are later than their stamps: eight repeats, and the Unix lag falls from 337 ms."""
+def test_honor_v10_lies_completely_in_the_start_up(realdata):
+    """All 25 frames lag their timestamps: there are eight repeats, and the Unix lag falls from 337 ms."""
     capture = read_capture(realdata / "honor_v10")
     assert capture.repeats == (2, 5, 11, 14, 16, 18, 21, 23)
     assert all("start-up" in frame.skip_codes for frame in capture.frames)
@@ -424,8 +424,8 @@ def test_honor_v10_lies_wholly_in_the_startup(realdata):
     ("name", "frames", "usable"),
     [("lhaippp_car", 103, 103), ("nexus5_162941", 152, 152), ("gopro_karma", 362, 361), ("gopro_hero7", 352, 328)],
 )
-def test_real_captures_join_whole_and_show_no_false_startup(realdata, name, frames, usable):
-    """Converted captures join to the last frame; none is taken for a recorder that starts."""
+def test_real_captures_join_completely_and_show_no_false_start_up(realdata, name, frames, usable):
+    """Converted captures join up to the last frame, and no recorder start-up is reported."""
     capture = read_capture(realdata / name)
     assert (len(capture.frames), len(capture.usable)) == (frames, usable)
     assert capture.counts["metadata_joined"] == frames

@@ -1,4 +1,4 @@
-"""What the fuzzer has found (tests/fuzz_readers.py), and what stood beside it: an error of one line each time."""
+"""Inputs found by the fuzzer (tests/fuzz_readers.py) and similar ones: each gives a one-line error."""
 
 import struct
 import warnings
@@ -25,7 +25,7 @@ PROFILE = b"virest_profile: 1\nimage: {width: 64, height: 48}\n"
 
 
 def refusal(reader: Callable[[Path], Any], path: Path, data: bytes) -> str:
-    """The error with which a reader refuses these bytes, without a warning of numpy's before it."""
+    """The error of a reader for these bytes, with numpy's warnings treated as errors."""
     path.write_bytes(data)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -61,20 +61,20 @@ FOUND_YAML = {
 
 
 @pytest.mark.parametrize("case", FOUND_YAML)
-def test_profiles_that_were_found_are_refused_by_name(tmp_path: Path, case: str) -> None:
-    """Keys, numbers and tags on which the reader of profiles, ours and Kalibr's, once broke."""
+def test_malformed_profiles_give_a_specific_error(tmp_path: Path, case: str) -> None:
+    """Malformed keys, numbers and tags in virest's and Kalibr's profiles."""
     data, says = FOUND_YAML[case]
     assert says in refusal(read_any_profile, tmp_path / "camera.yaml", data)
 
 
-def test_a_settings_key_below_a_line_is_named_with_its_neighbour(tmp_path: Path) -> None:
-    """The key itself is in the message, not the place above it."""
+def test_a_settings_key_with_an_underscore_is_named_with_a_suggestion(tmp_path: Path) -> None:
+    """The message names the key itself and the nearest known key."""
     text = refusal(read_settings, tmp_path / "settings.yaml", b"_deblur: tiled")
     assert "unknown key '_deblur', did you mean 'deblur'?" in text
 
 
-def test_noise_that_is_no_number_of_a_float_is_refused(tmp_path: Path) -> None:
-    """Kalibr's imu.yaml with a whole number of 401 digits."""
+def test_a_noise_value_beyond_a_float_is_refused(tmp_path: Path) -> None:
+    """Kalibr's imu.yaml with an integer of 401 digits."""
     refusal(lambda path: parse_imu(load_yaml_mapping(path)), tmp_path / "imu.yaml", b"update_rate: 1" + b"0" * 400)
 
 
@@ -86,8 +86,8 @@ POSES = {
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_a_sensor_whose_pose_is_no_rigid_motion_is_refused(tmp_path: Path, pose: str) -> None:
-    """Products that overflow, and a matrix that has no inverse."""
+def test_a_sensor_pose_that_is_not_rigid_is_refused(tmp_path: Path, pose: str) -> None:
+    """Products that overflow, and a matrix without an inverse."""
     rows = b"[" + POSES[pose] + b"]"
     movie = MovieIndex(64, 48, 1, np.arange(2), (0,), (0,))  # type: ignore[arg-type]
 
@@ -97,8 +97,8 @@ def test_a_sensor_whose_pose_is_no_rigid_motion_is_refused(tmp_path: Path, pose:
     assert "T_BS" in refusal(read, tmp_path / "sensor.yaml", b"T_BS: {data: " + rows + b"}")
 
 
-def test_a_header_with_tabs_between_its_letters_is_still_that_header(tmp_path: Path) -> None:
-    """Whatever white space stands in the columns' names: the file is known by them, and read or refused by them."""
+def test_a_header_with_tabs_in_its_names_is_recognised(tmp_path: Path) -> None:
+    """White space in column names does not prevent the file's recognition; it is then read or rejected."""
     refusal(read_gyro_accel, tmp_path / "gyro_accel.csv", b"oc],gx[rad/\t\ts],ad")
     path = tmp_path / "gyro_accel.csv"
     path.write_bytes(
@@ -109,26 +109,29 @@ def test_a_header_with_tabs_between_its_letters_is_still_that_header(tmp_path: P
 
 
 def test_a_time_with_tabs_and_other_line_ends_is_shown_in_one_line(tmp_path: Path) -> None:
-    """What Python takes for the end of a line, and a table's reader does not."""
+    """Python treats more characters as line ends than the table reader does."""
     header = b"Timestamp[nanosec], gx[rad/s], gy[rad/s], gz[rad/s], ax[m/s^2], ay[m/s^2], az[m/s^2]\n"
     assert "'12 3<tab>4'" in refusal(read_gyro_accel, tmp_path / "gyro_accel.csv", header + b"12\x0b3\t4,1,2,3,4,5,6\n")
 
 
-def test_a_list_whose_pictures_stand_behind_all_columns_is_refused(tmp_path: Path) -> None:
-    """Sixteen fields are read; a name in the seventeenth is said."""
+def test_a_picture_name_beyond_the_last_column_is_refused(tmp_path: Path) -> None:
+    """Sixteen fields are read; the error mentions field 17."""
     assert "field 17" in refusal(read_picture_list, tmp_path / "data.csv", b"1," + b"," * 15 + b"a.png\n")
 
 
-def test_pictures_called_by_raised_digits_are_sorted(tmp_path: Path) -> None:
-    """A raised two is a digit to Python, and no number."""
+def test_picture_names_with_superscript_digits_are_sorted(tmp_path: Path) -> None:
+    """Python treats a superscript two as a digit, but it is not a number."""
     for name in ("²10.png", "²9.png"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "times.txt").write_text("1000000000\n2000000000\n")
     assert read_picture_list(tmp_path / "times.txt").names == ("²9.png", "²10.png")
 
 
-def test_a_sample_larger_than_its_movie_is_no_lack_of_memory(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """FFmpeg calls it that, for 512 MB of a file of 4 kB; the user is told of the claim, and the rest is read."""
+def test_a_sample_larger_than_its_movie_is_not_a_memory_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """FFmpeg reports 512 MB in a file of 4 kB as lack of memory.
+
+    The log reports the impossible size, and the rest is read.
+    """
     path = tmp_path / "movie.mp4"
     write_movie(path, moving_pictures(4, width=32, height=32), [i * PERIOD_NS for i in range(4)])
     data = bytearray(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Gyroflow's log beside a movie, and movies with their samples inside."""
+"""Gyroflow's log beside a movie, and movies with embedded samples."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HEADER = {
 
 
 def write_log(path: Path, columns: int = 6, first: str = "GYROFLOW IMU LOG", **changes: str | None) -> None:
-    """A log of whole counts; ``changes`` replace or, None, leave out keys of the header."""
+    """A log of integer counts; ``changes`` replaces keys of the header or, with None, leaves them out."""
     header = {key: value for key, value in {**HEADER, **changes}.items() if value is not None}
     counts = [39, 86, 183, -137, -1689, 986, 3, 4, 5][:columns]
     rows = [f"{t},{','.join(map(str, [counts[0] + t % 7, *counts[1:]]))}" for t in range(-40, 700, 5)]
@@ -41,7 +41,7 @@ def write_log(path: Path, columns: int = 6, first: str = "GYROFLOW IMU LOG", **c
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A movie with its log, and another movie that has none."""
+    """A movie with its log, and another movie without one."""
     place = tmp_path / "clip"
     place.mkdir()
     write_film(place / "C0042.MP4", COUNT)
@@ -51,7 +51,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_log_and_its_movie_make_a_capture(folder):
-    """The movie of the log's name is taken, samples are scaled and turned, readout and direction come along."""
+    """The movie with the log's name is used; samples are scaled and rotated; readout and direction are read."""
     capture = read_capture(folder)
     assert (capture.kind, capture.movie.name) == ("Gyroflow", "C0042.MP4")
     assert len(capture.usable) == COUNT
@@ -71,8 +71,8 @@ def test_a_log_and_its_movie_make_a_capture(folder):
     assert any(note.code == "exposure-unknown" for note in capture.notes)
 
 
-def test_orientation_as_the_telemetry_parser_takes_it(tmp_path):
-    """The same letters turn the same counts into the same vector there, for every sign and order that is asked."""
+def test_the_orientation_matches_the_telemetry_parser(tmp_path):
+    """The same letters give the same vector for all tested signs and orders."""
     parser = pytest.importorskip("telemetry_parser")
     for letters in ("XYZ", "YxZ", "zXy", "xzY", "Zyx"):
         path = tmp_path / f"{letters}.gcsv"
@@ -81,12 +81,12 @@ def test_orientation_as_the_telemetry_parser_takes_it(tmp_path):
         table = read_log(path, read_header(path))
         np.testing.assert_allclose(table.gyro_rad_s[5], np.deg2rad(theirs["gyro"]), rtol=1e-9)
         np.testing.assert_allclose(table.accel_m_s2[5], theirs["accl"], rtol=1e-9)
-        # the package counts from the log's first row, we from the first frame
+        # the package counts from the log's first row, virest from the first frame
         assert (table.time_ns[5] - table.time_ns[0]) / 1e6 == pytest.approx(theirs["timestamp_ms"])
 
 
 def test_a_log_without_accelerometer_or_scales(folder):
-    """Three columns leave the acceleration unknown; without scales counts are rad/s and milliseconds."""
+    """Three columns leave the acceleration unknown; without scales, counts are in rad/s and ms."""
     write_log(folder / "C0042.gcsv", columns=3, tscale=None, gscale=None, orientation="xyz", frame_readout_time=None)
     capture = read_capture(folder)
     assert not capture.imu.has_accelerometer
@@ -106,16 +106,16 @@ def test_a_log_without_accelerometer_or_scales(folder):
         ({"first": "something else"}, "begins with 'something else'"),
     ],
 )
-def test_bad_logs_end_in_one_line(folder, changes, words):
-    """Each fault of the header is named with its value."""
+def test_bad_gyroflow_logs_give_an_error(folder, changes, words):
+    """The error names the key or value at fault."""
     write_log(folder / "C0042.gcsv", **changes)
     with pytest.raises(CaptureError, match=words) as fault:
         read_capture(folder)
     assert fault.value.exit_code == 4
 
 
-def test_which_movie_and_which_log_must_be_clear(folder):
-    """Two logs, or no movie of the log's name among several, are refused."""
+def test_an_ambiguous_movie_or_log_is_refused(folder):
+    """Two logs, or several movies without the log's name, are errors."""
     write_log(folder / "C0043.gcsv")
     with pytest.raises(ImuError, match=r"2 \.gcsv files"):
         read_capture(folder)
@@ -127,26 +127,26 @@ def test_which_movie_and_which_log_must_be_clear(folder):
         read_capture(folder)
 
 
-# ── samples inside the movie ─────────────────────────────────────────────────────────────────────────────────────
+# ── samples embedded in the movie ────────────────────────────────────────────────────────────────────────────────
 
 
 def parser_of(samples: list[dict[str, object]], camera: str = "GoPro", model: str | None = "HERO9 Black"):
-    """A stand-in for the package, which gives these samples for whatever movie."""
+    """A substitute for the package that returns these samples for any movie."""
     given = SimpleNamespace(camera=camera, model=model, normalized_imu=lambda: samples)
     return SimpleNamespace(Parser=lambda _path: given)
 
 
 @pytest.fixture
 def film(tmp_path: Path) -> Path:
-    """A folder with nothing but a movie."""
+    """A folder that contains only a movie."""
     place = tmp_path / "GX010042"
     place.mkdir()
     write_film(place / "GX010042.MP4", COUNT)
     return place
 
 
-def test_samples_inside_the_movie(film, monkeypatch):
-    """The package's milliseconds, deg/s and m/s² become ours; rows without gyroscope are dropped and counted."""
+def test_samples_embedded_in_the_movie(film, monkeypatch):
+    """The package's ms, deg/s and m/s² are converted; rows without gyroscope values are dropped and counted."""
     samples: list[dict[str, object]] = [
         {"timestamp_ms": 5.0 * k, "gyro": (10.0, -20.0, 30.0), "accl": (9.8, 0.1, -0.2) if k % 2 else None}
         for k in range(-2, 160)
@@ -165,14 +165,14 @@ def test_samples_inside_the_movie(film, monkeypatch):
 
 
 def test_without_the_package_the_error_names_it(film, monkeypatch):
-    """One line says what to install."""
+    """The error names the extra to install."""
     monkeypatch.setitem(sys.modules, "telemetry_parser", None)
     with pytest.raises(ImuError, match=r"pip install 'virest\[telemetry\]'"):
         read_capture(film)
 
 
 def test_a_movie_without_telemetry_is_refused(film, monkeypatch):
-    """The real package refuses a plain movie, and a movie whose samples are empty is none either."""
+    """The real package rejects a plain movie; a movie with empty samples is rejected too."""
     pytest.importorskip("telemetry_parser")
     with pytest.raises(ImuError, match="holds no inertial samples"):
         read_capture(film)

@@ -1,4 +1,4 @@
-"""Files made to hurt: refused in one line, at once, without the memory that they ask for."""
+"""Hostile files are rejected quickly in one line, without the memory that they claim."""
 
 import os
 import resource
@@ -30,7 +30,7 @@ GYRO_HEAD = "Timestamp[nanosec], gx[rad/s], gy[rad/s], gz[rad/s], ax[m/s^2], ay[
 
 
 def find_box(data: bytes, path: tuple[bytes, ...], start: int = 0, end: int | None = None) -> int:
-    """Where a box of an MP4 file begins."""
+    """Position of a box in an MP4 file."""
     end = len(data) if end is None else end
     while start + 8 <= end:
         size, kind = struct.unpack_from(">I4s", data, start)
@@ -41,14 +41,14 @@ def find_box(data: bytes, path: tuple[bytes, ...], start: int = 0, end: int | No
 
 
 def grown_by_mb(function: Callable[[], object]) -> float:
-    """How much the largest memory ever used by this process has grown."""
+    """Growth of this process's peak memory."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     function()
     return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
 
 
 def outcome_of(reader: Callable[[Path], Any], path: Path) -> Any:
-    """What a reader gives, or the text of the error with which it refuses."""
+    """The result of a reader, or the text of its error."""
     try:
         return reader(path)
     except CaptureError as error:
@@ -57,7 +57,7 @@ def outcome_of(reader: Callable[[Path], Any], path: Path) -> Any:
 
 @pytest.fixture
 def movie(tmp_path: Path) -> Path:
-    """A sound movie of a few frames, 64 x 96."""
+    """An intact movie of a few frames, 64 × 96."""
     path = tmp_path / "movie.mp4"
     write_movie(path, moving_pictures(6), [i * PERIOD_NS for i in range(6)])
     return path
@@ -67,8 +67,8 @@ def movie(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("count", [1 << 24, 1 << 28, 0x7FFFFFFF])
-def test_a_table_that_promises_millions_of_frames_gets_no_memory(movie: Path, count: int) -> None:
-    """Twelve bytes that would make an index of a gigabyte."""
+def test_a_table_that_claims_millions_of_frames_gets_no_memory(movie: Path, count: int) -> None:
+    """Twelve bytes claim an index of a gigabyte."""
     data = bytearray(movie.read_bytes())
     struct.pack_into(">II", data, find_box(data, (*TABLE, b"stsz")) + 12, 1, count)
     struct.pack_into(">I", data, find_box(data, (*TABLE, b"stsc")) + 20, count)
@@ -81,8 +81,8 @@ def test_a_table_that_promises_millions_of_frames_gets_no_memory(movie: Path, co
     assert grown_by_mb(refused) < 300
 
 
-def test_a_picture_of_two_gigabytes_ends_the_movie(movie: Path) -> None:
-    """The frames before it are there; asking for its memory is no fault of ours."""
+def test_a_frame_of_two_gigabytes_ends_the_movie(movie: Path) -> None:
+    """The frames before it are read; the claim does not cause a memory error."""
     data = bytearray(movie.read_bytes())
     sizes = find_box(data, (*TABLE, b"stsz")) + 20
     struct.pack_into(">I", data, sizes + 4 * 5, 0x7FFFFFFF)
@@ -92,8 +92,8 @@ def test_a_picture_of_two_gigabytes_ends_the_movie(movie: Path) -> None:
     assert [frame for frame, picture in read_gray(movie, index, range(5)) if picture is not None] == [0, 1, 2, 3, 4]
 
 
-def test_a_header_that_claims_huge_pictures_is_not_believed(movie: Path) -> None:
-    """The container says 50000 x 50000, the pictures themselves are small: read as they are, or refused."""
+def test_a_header_that_claims_huge_frames_is_not_trusted(movie: Path) -> None:
+    """The container states 50000 × 50000, but the frames are small: they are read as they are, or rejected."""
     data = bytearray(movie.read_bytes())
     struct.pack_into(">HH", data, find_box(data, (*TABLE, b"stsd")) + 48, 50000, 50000)
     movie.write_bytes(data)
@@ -101,10 +101,8 @@ def test_a_header_that_claims_huge_pictures_is_not_believed(movie: Path) -> None
     assert "picture size" in found if isinstance(found, str) else (found.width, found.height) == (64, 96)
 
 
-def test_pictures_that_say_themselves_that_they_are_huge_are_not_decoded(
-    movie: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The limit holds in the decoder, where a later header may change the size."""
+def test_frames_above_the_pixel_limit_are_not_decoded(movie: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit also applies in the decoder, where a later header may change the size."""
     index = probe_movie(movie)
     monkeypatch.setattr(video, "MAX_PIXELS", 64 * 96 - 1)
     with pytest.raises(VideoError, match="picture size 64x96"):
@@ -115,7 +113,7 @@ def test_pictures_that_say_themselves_that_they_are_huge_are_not_decoded(
 
 
 def test_the_number_of_frames_has_a_limit(movie: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One line that says how many."""
+    """The error states the limit."""
     monkeypatch.setattr(video, "MAX_FRAMES", 3)
     with pytest.raises(VideoError, match="more than 3 frames"):
         probe_movie(movie)
@@ -125,7 +123,7 @@ def test_the_number_of_frames_has_a_limit(movie: Path, monkeypatch: pytest.Monke
 
 
 def test_a_line_of_ten_gigabytes_is_refused_after_its_first_bytes(tmp_path: Path) -> None:
-    """The file is sparse; whoever read it would never end."""
+    """The file is sparse; reading it completely would take very long."""
     path = tmp_path / "gyro_accel.csv"
     path.write_text(GYRO_HEAD + "1" * (2 * files.MAX_LINE_BYTES))
     with path.open("r+b") as file:
@@ -142,8 +140,8 @@ HUGE = ["9223372036854775807", "9223372036854775808", "1" * 400, "-9223372036854
 
 
 @pytest.mark.parametrize("number", HUGE)
-def test_numbers_that_overflow_end_in_a_dropped_row_or_one_line(tmp_path: Path, number: str) -> None:
-    """In times and in values, of every table."""
+def test_numbers_that_overflow_give_a_dropped_row_or_one_line(tmp_path: Path, number: str) -> None:
+    """Times and values of every table are tried."""
     rows = [f"{1_000_000_000 + i * 5_000_000},0.1,0.2,0.3,0,9.8,0" for i in range(8)]
     for column in range(7):
         fields = rows[4].split(",")
@@ -161,7 +159,7 @@ def test_numbers_that_overflow_end_in_a_dropped_row_or_one_line(tmp_path: Path, 
 
 
 def _reads_or_refuses(reader: Callable[[Path], object], path: Path) -> None:
-    """Either a table of rising times, or one line."""
+    """The reader returns rising times or a one-line error."""
     found = outcome_of(reader, path)
     if isinstance(found, str):
         assert len(found.splitlines()) == 1
@@ -172,8 +170,8 @@ def _reads_or_refuses(reader: Callable[[Path], object], path: Path) -> None:
 
 @pytest.mark.parametrize("shift", [2**62, -(2**62), 2**63 - 1, -(2**63)])
 @pytest.mark.parametrize("name", ["edge_epochs.txt", "gyro_accel.csv", "frame_timestamps.txt"])
-def test_clocks_far_beyond_each_other_end_in_one_line_or_a_warning(writer, name: str, shift: int) -> None:
-    """Differences of stamps that do not fit in 64 bits."""
+def test_distant_clocks_give_one_line_or_a_warning(writer, name: str, shift: int) -> None:
+    """Differences of timestamps do not fit in 64 bits."""
     writer.write()
     path = writer.folder / name
     if name == "edge_epochs.txt":
@@ -191,14 +189,14 @@ def test_clocks_far_beyond_each_other_end_in_one_line_or_a_warning(writer, name:
         assert all(abs(frame.time_s) < 1e6 for frame in found.frames)
 
 
-def test_a_list_with_a_picture_of_a_thousand_letters_is_refused(tmp_path: Path) -> None:
-    """No file system has such a name; it is missing like any other."""
+def test_a_picture_name_of_a_thousand_letters_is_refused(tmp_path: Path) -> None:
+    """No file system has such a name; the picture counts as missing."""
     (tmp_path / "data.csv").write_text(f"#timestamp [ns],filename\n1000000000,{'a' * 1000}.png\n")
     assert "none of its 1 rows has a picture" in outcome_of(read_picture_list, tmp_path / "data.csv")
 
 
 def test_pipes_anywhere_in_a_folder_do_not_hang(writer) -> None:
-    """In the place of every file that is looked for."""
+    """A pipe replaces each file that readers look for."""
     writer.write()
     names = ("camera.yaml", "frames.csv", "imu.csv", "raw_accel_gyro.csv", "a.gcsv", "data.csv", "mav0", "imu0", "data")
     for name in names:

@@ -1,4 +1,4 @@
-"""What `virest inspect` says of a capture, sound or not."""
+"""Output of ``virest inspect`` for intact and damaged captures."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from virest.app.inspect import as_json, inspect_capture
 from virest.capture.folder import read_capture
 
 
-def test_sound_capture_is_tabled(writer):
-    """Counts, clocks, rates, spans and exposure appear in both forms, and the code is 0."""
+def test_an_intact_capture_is_summarised(writer):
+    """Counts, clocks, rates, spans and exposure appear in both forms, and the exit code is 0."""
     facts, text, code = inspect_capture(writer.write())
     assert code == 0
     assert json.loads(json.dumps(facts, allow_nan=False)) == facts
@@ -22,7 +22,7 @@ def test_sound_capture_is_tabled(writer):
 
 
 def test_dropped_rows_and_skipped_frames_are_explained(writer):
-    """Each dropped row has its reason, each run of left-out frames too."""
+    """Each dropped row and each run of skipped frames has a reason."""
     writer.imu_ns = [t for t in writer.imu_ns if t > writer.stamps_ns[3]]
     writer.imu_ns.insert(40, writer.imu_ns[39])
     facts, text, code = inspect_capture(writer.write())
@@ -33,8 +33,8 @@ def test_dropped_rows_and_skipped_frames_are_explained(writer):
     assert "before the first IMU row" in text
 
 
-def test_unusable_capture_shows_what_can_be_read(writer):
-    """With a broken movie the tables are still counted, the fault stands first, and the code is 4."""
+def test_an_unusable_capture_shows_its_readable_parts(writer):
+    """With a broken movie the tables are still counted, the error comes first, and the exit code is 4."""
     writer.write()
     (writer.folder / "movie.mp4").write_bytes(b"cut")
     facts, text, code = inspect_capture(writer.folder)
@@ -46,7 +46,7 @@ def test_unusable_capture_shows_what_can_be_read(writer):
     assert json.dumps(facts, allow_nan=False)
 
 
-def test_missing_path_is_code_4(tmp_path):
+def test_a_missing_path_exits_with_4(tmp_path):
     """A path that does not exist is an unusable capture."""
     facts, text, code = inspect_capture(tmp_path / "none")
     assert code == 4
@@ -54,8 +54,8 @@ def test_missing_path_is_code_4(tmp_path):
     assert facts["notes"]
 
 
-def test_broken_profile_is_a_note(writer):
-    """A camera.yaml that cannot be used is said before any work; the capture itself is fine."""
+def test_a_broken_profile_is_a_note(writer):
+    """An invalid camera.yaml is reported before any work; the capture itself is usable."""
     writer.write()
     (writer.folder / "camera.yaml").write_text("virest_profile: 1\nimage: {width: 64, height: 96}\nshuter: {}\n")
     facts, text, code = inspect_capture(writer.folder)

@@ -1,4 +1,4 @@
-"""Movies of other kinds: HDR, chroma's place, 4K, 240 frames a second, half an hour, turned, an iPhone's."""
+"""Kinds of movies: HDR, chroma location, 4K, 240 frames per second, long pauses, rotation tags, iPhone folders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from virest.errors import VideoError
 
 
 def write(path: Path, pictures, ticks, codec: str = "libx264", **tags: int) -> Path:
-    """A movie of RGB pictures at PTS in ticks of 90 kHz; tags: of the codec's context."""
+    """A movie of RGB frames at PTS in ticks of 90 kHz; ``tags`` are set on the codec context and the frames."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=30)
         stream.height, stream.width = pictures[0].shape[:2]
@@ -38,15 +38,15 @@ def write(path: Path, pictures, ticks, codec: str = "libx264", **tags: int) -> P
 
 @pytest.mark.parametrize(("curve", "name"), [(16, "PQ"), (18, "HLG")])
 def test_hdr_movies_are_refused_by_name(tmp_path: Path, curve: int, name: str) -> None:
-    """Never taken for sRGB in silence."""
+    """HDR is never silently treated as sRGB."""
     picture = np.full((48, 64, 3), 120, np.uint8)
     movie = write(tmp_path / "movie.mp4", [picture] * 3, range(0, 9000, 3000), color_trc=curve)
     with pytest.raises(VideoError, match=name):
         probe_movie(movie)
 
 
-def test_chroma_lies_on_the_left_column() -> None:
-    """A chroma sample k belongs to column 2 k: a ramp comes back without a shift, up to rounding."""
+def test_chroma_is_located_at_the_left_column() -> None:
+    """Chroma sample k belongs to column 2 k: a ramp is decoded without a shift, up to rounding."""
     frame = av.VideoFrame(64, 16, "yuv420p")
     luma = np.full((16, 64), 120, np.uint8)
     ramp = np.tile((64 + 2 * np.arange(32)).astype(np.uint8), (8, 1))
@@ -63,8 +63,8 @@ def test_chroma_lies_on_the_left_column() -> None:
     assert np.mean((centred - expected)[inner]) == pytest.approx(-0.5 * 1.402 * 255 / 224, abs=0.2)
 
 
-def test_frames_of_4k_come_back(tmp_path: Path) -> None:
-    """3840 x 2160, and its luma."""
+def test_4k_frames_are_read(tmp_path: Path) -> None:
+    """Frames of 3840 × 2160 are decoded with the right content."""
     rows, columns = np.mgrid[0:2160, 0:3840]
     pictures = [
         np.repeat(((rows + columns + 40 * k) // 24 % 200)[..., None], 3, axis=2).astype(np.uint8) for k in (0, 1)
@@ -76,8 +76,8 @@ def test_frames_of_4k_come_back(tmp_path: Path) -> None:
     assert np.abs(found[1].astype(int) - pictures[1]).mean() < 2
 
 
-def test_times_of_240_frames_a_second_and_of_half_an_hour_are_exact(tmp_path: Path) -> None:
-    """375 ticks apart, then after half an hour's pause; a frame is found there by seeking."""
+def test_times_at_240_frames_per_second_and_after_half_an_hour_are_exact(tmp_path: Path) -> None:
+    """Frames are 375 ticks apart and continue after a pause of 30 min; a late frame is found by seeking."""
     late = 30 * 60 * 90_000
     ticks = [*range(0, 375 * 40, 375), *range(late, late + 375 * 40, 375)]
     pictures = [np.full((32, 48, 3), 20 + 2 * k, np.uint8) for k in range(80)]
@@ -90,7 +90,7 @@ def test_times_of_240_frames_a_second_and_of_half_an_hour_are_exact(tmp_path: Pa
 
 
 QUARTER_TURN = (0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
-"""The display matrix that phones write for an upright recording of a sensor that lies on its side."""
+"""Display matrix that phones write for an upright recording with a landscape sensor."""
 
 
 def turn(movie: Path, matrix: tuple[int, ...] = QUARTER_TURN) -> Path:
@@ -104,7 +104,7 @@ def turn(movie: Path, matrix: tuple[int, ...] = QUARTER_TURN) -> Path:
 
 
 def striped(width: int = 64, height: int = 48) -> np.ndarray:
-    """A picture that no turn leaves as it is: dark on its left, a bright corner above."""
+    """A picture that every rotation changes: dark on the left, with a bright top-left corner."""
     picture = np.full((height, width, 3), 160, np.uint8)
     picture[:, : width // 2] = 60
     picture[: height // 4, : width // 4] = 220
@@ -112,11 +112,11 @@ def striped(width: int = 64, height: int = 48) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["movie.mp4", "IMG_0042.MOV"])
-def test_a_rotation_tag_turns_no_pixel(tmp_path: Path, name: str) -> None:
-    """Rows stay the sensor's rows: the size and the pixels are those that are stored, the turn is known for films."""
+def test_a_rotation_tag_does_not_rotate_pixels(tmp_path: Path, name: str) -> None:
+    """Rows stay the sensor's rows: size and pixels are as stored."""
     movie = turn(write(tmp_path / name, [striped()] * 3, range(0, 9000, 3000)))
     with av.open(str(movie)) as container:
-        assert abs(next(container.decode(video=0)).rotation) == 90  # the tag is one that others follow
+        assert abs(next(container.decode(video=0)).rotation) == 90  # FFmpeg recognises the tag
     index = probe_movie(movie)
     assert (index.width, index.height) == (64, 48)
     ((_, picture),) = read_frames(movie, index, 1, 1)
@@ -127,8 +127,8 @@ def test_a_rotation_tag_turns_no_pixel(tmp_path: Path, name: str) -> None:
     assert luma.shape == (48, 64)
 
 
-def test_bt2020_pictures_of_ordinary_brightness_have_their_own_matrix(tmp_path: Path) -> None:
-    """Luma of BT.2020 weighs red by 0.2627: with another matrix a red wall would come back in another red."""
+def test_bt2020_sdr_frames_use_the_bt2020_matrix(tmp_path: Path) -> None:
+    """BT.2020 luma weights red by 0.2627; another matrix changes the colour of a red wall."""
     red = np.full((48, 64, 3), (200, 30, 60), np.uint8)
     frame = av.VideoFrame.from_ndarray(red, format="rgb24").reformat(format="yuv420p", dst_colorspace=9)
     frame.colorspace = 9
@@ -137,15 +137,15 @@ def test_bt2020_pictures_of_ordinary_brightness_have_their_own_matrix(tmp_path: 
     assert np.abs(to_rgb(frame).astype(int) - red).max() > 8
 
 
-def test_pictures_of_10_bits_and_ordinary_brightness_are_read(tmp_path: Path) -> None:
-    """Without an HDR curve 10 bits are 8 finer ones."""
+def test_10_bit_sdr_frames_are_read(tmp_path: Path) -> None:
+    """Without an HDR curve, 10 bits are a finer scale of 8 bits."""
     ramp = np.repeat(np.linspace(20, 230, 64)[None, :, None], 48, axis=0).repeat(3, axis=2).astype(np.uint8)
     frame = av.VideoFrame.from_ndarray(ramp, format="rgb24").reformat(format="yuv420p10le")
     assert np.abs(to_rgb(frame).astype(int) - ramp).max() <= 4
 
 
-def test_an_iphone_s_folder_with_a_turned_movie_keeps_its_landscape(tmp_path: Path) -> None:
-    """The intrinsics of the unturned buffer hold: width is the long side, and fx, cx are those logged."""
+def test_an_iphone_folder_with_a_rotated_movie_keeps_landscape_intrinsics(tmp_path: Path) -> None:
+    """The logged intrinsics of the unrotated buffer apply: width is the long side, with the logged fx and cx."""
     count, width, height = 12, 96, 64
     stamps = [1_000_000_000_000 + k * 33_333_333 for k in range(count)]
     ticks = [round(k * 33_333_333 * 9e-5) for k in range(count)]

@@ -1,4 +1,4 @@
-"""A focal length that is logged frame by frame and changes is followed; rounding is not."""
+"""A logged focal length that changes from frame to frame is used; rounding is not treated as a change."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HALF_DIAGONAL = 734.0
 
 
 def write_with(writer: CaptureWriter, focal: list[str]) -> Path:
-    """The writer's capture with a focal length of its own for each frame."""
+    """The writer's capture with a separate focal length for each frame."""
     writer.write()
     rows = [
         f"{t},{fx},{fx},{n + 200},{writer.exposure_ns},33333333,{writer.readout_ns},144,3.95,0.1,3"
@@ -33,8 +33,11 @@ def write_with(writer: CaptureWriter, focal: list[str]) -> Path:
     return writer.folder
 
 
-def test_a_lens_that_focuses_is_followed(writer: CaptureWriter) -> None:
-    """In steps, as an actuator moves: at the middle of each frame the lens has that frame's focal length."""
+def test_a_focusing_lens_is_followed(writer: CaptureWriter) -> None:
+    """The focal length changes in steps, as an actuator moves.
+
+    The lens has the logged value at the middle of each frame.
+    """
     focal = [80.0] * 10 + [81.5] * 8 + [83.25] * 12
     capture = read_capture(write_with(writer, [f"{fx:.2f}" for fx in focal]))
     assert [n.text for n in capture.notes if n.code == "focal-varies"]
@@ -53,8 +56,8 @@ def test_a_lens_that_focuses_is_followed(writer: CaptureWriter) -> None:
     assert "field" not in str(profile_mapping(profile)["extensions"])
 
 
-def test_what_a_profile_says_of_its_focal_length_stands(writer: CaptureWriter) -> None:
-    """A drift in camera.yaml is not added to by the log."""
+def test_a_focal_drift_in_the_profile_takes_precedence(writer: CaptureWriter) -> None:
+    """The log is not added to a drift in camera.yaml."""
     folder = write_with(writer, [f"{80 + 0.1 * k:.2f}" for k in range(30)])
     own = {"virest_profile": 1, "image": {"width": 64, "height": 96}, "intrinsics": {"fx_px": 80.0}}
     drift = {"extensions": {"focal_drift": {"focal_drift_per_s": 0.03}}}
@@ -78,8 +81,8 @@ def test_what_a_profile_says_of_its_focal_length_stands(writer: CaptureWriter) -
     ],
     ids=["constant", "last digit", "rounding", "one step", "drift", "holes", "none"],
 )
-def test_changes_count_beyond_rounding(logged: np.ndarray, followed: bool) -> None:
-    """Two steps of the last digit are none; what was not logged lies between its neighbours."""
+def test_only_changes_beyond_rounding_count(logged: np.ndarray, followed: bool) -> None:
+    """Two steps of the last digit do not count; missing values are interpolated."""
     scales = focal_scales(logged, TIMES, HALF_DIAGONAL)
     assert (scales is not None) is followed
     if scales is not None and np.isfinite(logged).all():
@@ -88,8 +91,8 @@ def test_changes_count_beyond_rounding(logged: np.ndarray, followed: bool) -> No
         np.testing.assert_allclose(np.diff(scales), np.diff(scales)[0], rtol=1e-6)
 
 
-def test_a_fault_of_the_log_is_no_zoom() -> None:
-    """One row with the focal length of something else is bridged."""
+def test_an_outlier_in_the_log_is_not_a_zoom() -> None:
+    """A single row with a very different focal length is interpolated."""
     logged = 980.4812 * (1 + 0.01 * TIMES)
     spoilt = logged.copy()
     spoilt[20] = 2766.0
@@ -99,7 +102,7 @@ def test_a_fault_of_the_log_is_no_zoom() -> None:
 
 
 def test_steps_and_corners() -> None:
-    """Decimals as written; a line that rests is two points."""
+    """``written_step`` finds the smallest decimal; ``corners`` keeps two points of a constant segment."""
     assert written_step(np.array([3.0, 7.0])) == 1.0
     assert written_step(np.array([3.25, 7.0])) == pytest.approx(0.01)
     times, values = corners(np.arange(6.0), np.array([1.0, 1.0, 1.0, 2.0, 2.0, 3.0]))
@@ -108,7 +111,7 @@ def test_steps_and_corners() -> None:
 
 
 def test_a_simulated_autofocus_is_followed(tmp_path: Path) -> None:
-    """The focal length breathes by 6 % within a second: between frames too, the lens is the true one."""
+    """The focal length varies by ±6 % within a second; the lens is right between frames too."""
 
     def breathing(time_s: np.ndarray) -> np.ndarray:
         return 1.0 + 0.06 * np.sin(2 * np.pi * time_s)
@@ -117,7 +120,7 @@ def test_a_simulated_autofocus_is_followed(tmp_path: Path) -> None:
     simulate_command(tmp_path / "trip", width=120, height=160, frames=20, seed=4, exposure_ms=10, hidden=hidden)
     table = tmp_path / "trip" / "movie_metadata.csv"
     rows = list(csv.reader(table.read_text().splitlines()))
-    for k, row in enumerate(rows[1:]):  # logged for the middle of each frame, 10 ms of exposure and 20 of readout
+    for k, row in enumerate(rows[1:]):  # logged for the middle of each frame, with 10 ms exposure and 20 ms readout
         row[1:3] = [f"{float(px) * breathing(np.array(k / 30 + 0.015)):.4f}" for px in row[1:3]]
     table.write_text("\n".join(",".join(row) for row in rows) + "\n")
     capture = read_capture(tmp_path / "trip")

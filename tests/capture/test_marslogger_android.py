@@ -1,4 +1,4 @@
-"""The Android logger's files, in every variant that it wrote."""
+"""Files of MARSLogger for Android in all variants it has written."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ T = 28_670_386_486_113
 
 
 def put(tmp_path: Path, text: str, name: str = "table.txt") -> Path:
-    """Write the bytes of a table as they are."""
+    """Write a table's text unchanged."""
     path = tmp_path / name
     path.write_bytes(text.encode())
     return path
@@ -53,7 +53,7 @@ GYRO_VARIANTS = {
 @pytest.mark.parametrize("variant", GYRO_VARIANTS)
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_gyro_reads_every_variant(tmp_path, variant, end):
-    """Time, rates and accelerations come out the same from each header and row layout, nanoseconds exact."""
+    """Time, rates and accelerations are the same for each header and row layout, with exact nanoseconds."""
     header, row = GYRO_VARIANTS[variant]
     lines = [header, f"{T},{row}", f"{T + 5_000_001},{row}"]
     table = read_gyro_accel(put(tmp_path, end.join(lines) + end))
@@ -64,7 +64,7 @@ def test_gyro_reads_every_variant(tmp_path, variant, end):
 
 
 def test_gyro_counts_every_dropped_row_with_its_reason(tmp_path):
-    """Repeated headers, null and NaN rates, equal, falling and zero times, damage and a cut line are told apart."""
+    """Repeated headers, null and NaN rates, wrong times, damaged and truncated rows are counted separately."""
     row = "0.1,0.2,0.3,1,2,3"
     lines = [
         GYRO_SPACED,
@@ -99,7 +99,7 @@ def test_gyro_counts_every_dropped_row_with_its_reason(tmp_path):
 
 
 def test_rows_written_twice_are_read_once(tmp_path):
-    """A log in which every row stands twice lost nothing, unlike one whose times alone repeat."""
+    """A log that repeats every row has lost nothing, unlike one that repeats only its times."""
     rows = [f"{T + 5_000_000 * k},0.{k},0.2,0.3,null,null,null" for k in range(4)]
     table = read_gyro_accel(put(tmp_path, "\n".join([GYRO_TIGHT, *(row for row in rows for _ in range(2))]) + "\n"))
     assert table.time_ns.tolist() == [T + 5_000_000 * k for k in range(4)]
@@ -110,7 +110,7 @@ def test_rows_written_twice_are_read_once(tmp_path):
 
 
 def test_a_clock_that_begins_at_zero_keeps_its_first_times(tmp_path):
-    """Converted captures count from their first frame: 0 is then a stamp, and the gyroscope begins before it."""
+    """Converted captures count from their first frame: 0 is then a valid time, and gyroscope times may be negative."""
     stamps = read_frame_timestamps(put(tmp_path, "Frame timestamp[nanosec]\n0\n33333000\n66666000\n"))
     assert stamps.time_ns.tolist() == [0, 33_333_000, 66_666_000]
     rows = [f"{5_000_000 * k},0.{k + 3},0.2,0.3,1,2,3" for k in range(-3, 4)]
@@ -121,15 +121,15 @@ def test_a_clock_that_begins_at_zero_keeps_its_first_times(tmp_path):
     assert lost.dropped == {"time is zero or negative": 1}
 
 
-def test_last_row_without_its_end_is_not_trusted(tmp_path):
-    """A last number may be cut and still read as one, so the row goes."""
+def test_a_last_row_without_a_line_end_is_dropped(tmp_path):
+    """Its last number may be truncated and still be readable."""
     table = read_gyro_accel(put(tmp_path, f"{GYRO_TIGHT}\n1,1,1,1,1,1,1\n2,1,1,1,1,1,1\n3,1,1,1,1,1,1.7"))
     assert table.time_ns.tolist() == [1, 2]
     assert table.dropped == {"last line without its end": 1}
 
 
-def test_null_accelerometer_becomes_nan(tmp_path):
-    """A phone without accelerometer rows still has its rates."""
+def test_a_null_accelerometer_becomes_nan(tmp_path):
+    """The rates of a phone without accelerometer values are kept."""
     table = read_gyro_accel(put(tmp_path, f"{GYRO_TIGHT}\n1,1,2,3,null,null,null\n2,1,2,3,null,null,null\n"))
     assert np.isnan(table.accel_m_s2).all()
     assert len(table.time_ns) == 2
@@ -142,15 +142,15 @@ def test_null_accelerometer_becomes_nan(tmp_path):
         "Has Gyroscope? No\nHas Accelerometer? Yes\n",
     ],
 )
-def test_phone_without_gyroscope_is_named(tmp_path, first):
-    """The logger's own remark becomes the error, not a parse failure."""
+def test_a_phone_without_gyroscope_is_named(tmp_path, first):
+    """The logger's own remark becomes the error instead of a parse failure."""
     with pytest.raises(ImuError, match="no gyroscope"):
         read_gyro_accel(put(tmp_path, first))
 
 
 @pytest.mark.parametrize("time", ["9.02746E+13", "28670386486113.5", "2.867E13", "2,8"])
 def test_spreadsheet_times_are_refused(tmp_path, time):
-    """A time that a spreadsheet rounded is a clock error, not a row to guess at."""
+    """A time that a spreadsheet has rounded is a clock error."""
     if "," in time:
         text = GYRO_TIGHT.replace(",", ";") + "\n1;1;1;1;1;1;1\n"
     else:
@@ -160,7 +160,7 @@ def test_spreadsheet_times_are_refused(tmp_path, time):
 
 
 def test_tabs_for_commas_are_refused(tmp_path):
-    """A file re-saved with tabs is recognised as such."""
+    """The error for a file saved again with tabs names the tabs."""
     with pytest.raises(ClockError, match="tabs"):
         read_gyro_accel(put(tmp_path, GYRO_TIGHT.replace(",", "\t") + "\n1\t1\t1\t1\t1\t1\t1\n"))
 
@@ -196,7 +196,7 @@ METADATA_HEADERS = {
 
 @pytest.mark.parametrize("variant", METADATA_HEADERS)
 def test_metadata_reads_every_variant(tmp_path, variant):
-    """Exposure, readout and the rest are found by name in each layout; what a layout lacks is NaN."""
+    """Exposure, readout and other columns are found by name in each layout; missing columns are NaN."""
     header, row = METADATA_HEADERS[variant]
     table = read_movie_metadata(put(tmp_path, f"{header}\n{row.format(t=T)}\n{header}\n{row.format(t=T + 1)}\n"))
     assert table.time_ns.tolist() == [T, T + 1]
@@ -210,7 +210,7 @@ def test_metadata_reads_every_variant(tmp_path, variant):
 
 
 def test_metadata_null_and_placeholders_are_unknown(tmp_path):
-    """``null``, fx 1.0 and a readout of 0 are the logger's ways to say that it does not know."""
+    """The logger writes ``null``, fx 1.0 or a readout time of 0 for unknown values."""
     header = METADATA_HEADERS["v1"][0]
     table = read_movie_metadata(put(tmp_path, f"{header}\n{T},1.0,1.0,1,null,null,0,null,null,null,null\n"))
     for column in (table.fx_px, table.fy_px, table.exposure_s, table.readout_time_s, table.iso):
@@ -227,23 +227,23 @@ def test_metadata_null_and_placeholders_are_unknown(tmp_path):
     ],
     ids=["1 column", "2 columns", "microseconds without header", "nanoseconds without header"],
 )
-def test_stamps_read_every_variant(tmp_path, text, unix):
-    """Stamps are nanoseconds whatever the header, or none, says."""
+def test_timestamps_read_every_variant(tmp_path, text, unix):
+    """Timestamps are in ns for every header and without one."""
     table = read_frame_timestamps(put(tmp_path, text))
     np.testing.assert_array_equal(np.diff(table.time_ns), 33_400_000)
     assert table.time_ns[0] // 1_000_000 == T // 1_000_000
     assert (table.unix_ns is not None) == unix
 
 
-def test_cut_last_stamp_is_dropped(tmp_path):
-    """A stamp cut inside its number is smaller than its predecessors and goes."""
+def test_a_truncated_last_timestamp_is_dropped(tmp_path):
+    """A truncated number is smaller than its predecessors."""
     table = read_frame_timestamps(put(tmp_path, f"Frame timestamp[nanosec]\n{T}\n{T + 1}\n{str(T + 2)[:6]}"))
     assert table.time_ns.tolist() == [T, T + 1]
     assert table.dropped == {"time falls or leaps": 1}
 
 
 def test_edge_epochs_with_repeated_block(tmp_path):
-    """The source and the mean of all difference rows are read, appended blocks included."""
+    """The source and the mean of all difference rows are read, including appended blocks."""
     block = (
         "#Camera frame timestamp source according to CameraCharacteristics.SENSOR_INFO_TIMESTAMP_SOURCE is "
         "SENSOR_INFO_TIMESTAMP_SOURCE_UNKNOWN (0).\n#elapsedRealtimeNanos()\tnanoTime()\tDifference\n"
@@ -267,13 +267,13 @@ def test_edge_epochs_with_repeated_block(tmp_path):
     ],
 )
 def test_foreign_gyro_files_are_named(tmp_path, text, match):
-    """Each wrong content gets one line that says what stands there."""
+    """The error for each kind of wrong content states what the file contains."""
     with pytest.raises(ImuError, match=match):
         read_gyro_accel(put(tmp_path, text))
 
 
-def test_bytes_that_are_no_text_do_not_break_the_reader(tmp_path):
-    """Rows of undecodable bytes are dropped and counted."""
+def test_undecodable_bytes_are_dropped(tmp_path):
+    """Rows of undecodable bytes are counted."""
     path = tmp_path / "gyro_accel.csv"
     path.write_bytes(GYRO_TIGHT.encode() + b"\n1,1,1,1,1,1,1\n\xff\xfe\x80,2\n3,1,1,1,1,1,1\n")
     table = read_gyro_accel(path)
@@ -281,8 +281,8 @@ def test_bytes_that_are_no_text_do_not_break_the_reader(tmp_path):
     assert table.dropped == {"cut or unreadable row": 1}
 
 
-def test_one_endless_line_is_refused_unread(tmp_path):
-    """A line of megabytes is refused by the scan, before anything tries to hold it."""
+def test_a_very_long_line_is_refused(tmp_path):
+    """The scan rejects a line of several megabytes before the table is read."""
     path = tmp_path / "gyro_accel.csv"
     path.write_bytes(GYRO_TIGHT.encode() + b"\n" + b"1" * (3 << 20))
     with pytest.raises(ImuError, match="a line has more than"):
@@ -290,8 +290,8 @@ def test_one_endless_line_is_refused_unread(tmp_path):
 
 
 @pytest.mark.parametrize("shift", [0, 1, 65_535, 65_536, 65_537, 1 << 20])
-def test_long_line_is_found_wherever_it_lies(tmp_path, shift):
-    """The scan's chunk borders hide no long line, and make none of short ones."""
+def test_a_long_line_is_found_at_any_position(tmp_path, shift):
+    """Borders between the scan's chunks neither hide a long line nor create one."""
     short = b"x" * 99 + b"\n"
     body = short * (shift // 100) + b"y" * (shift % 100) + b"\n"
     path = tmp_path / "t.txt"
@@ -304,29 +304,29 @@ def test_long_line_is_found_wherever_it_lies(tmp_path, shift):
 
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=40))
 def test_strictly_rising_keeps_a_rising_subset(values):
-    """What is kept rises strictly, and every row is either kept or counted."""
+    """The kept times rise strictly, and every row is either kept or counted."""
     times = np.array(values)
     keep, lost = strictly_rising(times)
     assert (np.diff(times[keep]) > 0).all()
     assert keep.sum() + sum(lost.values()) == len(times)
 
 
-def test_single_leap_costs_one_row():
-    """One time far ahead is dropped alone, not all that follow it."""
+def test_a_single_leap_drops_one_row():
+    """Only the row with a time far ahead is dropped, not the rows after it."""
     keep, lost = strictly_rising(np.array([1, 2, 3000, 4, 5, 6]))
     assert keep.tolist() == [True, True, False, True, True, True]
     assert lost == {"time falls or leaps": 1}
 
 
 def test_times_that_mostly_fall_are_refused(tmp_path):
-    """A table whose times run backwards is no table of samples."""
+    """A table with falling times is an error."""
     rows = "".join(f"{100 - i},1,1,1,1,1,1\n" for i in range(20))
     with pytest.raises(ClockError, match="of 20 times rise"):
         read_gyro_accel(put(tmp_path, GYRO_TIGHT + "\n" + rows))
 
 
 def test_old_real_text_files(realdata):
-    """The published text samples of the first release parse whole."""
+    """The published text samples of the first release are read completely."""
     place = realdata / "mars_text_v1"
     assert len(read_gyro_accel(place / "test_data/mars_gyro_accel.csv").time_ns) == 226
     assert len(read_frame_timestamps(place / "test_data/mars_frame_timestamps.txt").time_ns) == 1812

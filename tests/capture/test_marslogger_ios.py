@@ -1,4 +1,4 @@
-"""Both iOS apps: units, signs, clocks, intrinsics, and what is refused."""
+"""Both iOS apps: units, signs, clocks, intrinsics and errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COUNT = 20
 
 
 def write_objective_c(folder: Path, *, seconds: bool = False, lens: str = "75.10, 75.20, 47.30, 31.70") -> list[int]:
-    """A folder of the first app with its movie as the Photos album calls it; returns the stamps."""
+    """A folder of the first app with a movie exported from the Photos app; returns the timestamps."""
     folder.mkdir(exist_ok=True)
     stamps = write_film(folder / "IMG_0042.MOV", COUNT, T0_NS)
     imu = range(T0_NS - 50_000_000, stamps[-1] + 100_000_000, 10_000_000)
@@ -44,7 +44,7 @@ def write_objective_c(folder: Path, *, seconds: bool = False, lens: str = "75.10
 
 
 def write_arkit(folder: Path, *, uptime_s: float = 91_234.567891234, spare: int = 2, transposed: bool = False) -> float:
-    """A folder of the ARKit app; ``spare`` rows, in the middle, belong to frames that the encoder left out."""
+    """A folder of the ARKit app; ``spare`` rows in the middle belong to frames that the encoder dropped."""
     folder.mkdir(exist_ok=True)
     steps = write_film(folder / "camera.mov", COUNT)
     times = sorted([*steps, *(steps[9] + 11_000_000 * (k + 1) for k in range(spare))])
@@ -62,7 +62,10 @@ def write_arkit(folder: Path, *, uptime_s: float = 91_234.567891234, spare: int 
 
 
 def test_objective_c_app(tmp_path):
-    """Rows are frames, exposures and intrinsics are taken, samples are brought from the app's g to the standard one."""
+    """Frames, exposures and intrinsics come from the rows.
+
+    Accelerations are converted from the app's g to the standard g.
+    """
     stamps = write_objective_c(tmp_path / "rec")
     capture = read_capture(tmp_path / "rec")
     assert capture.kind == "MARSLogger for iOS"
@@ -75,30 +78,30 @@ def test_objective_c_app(tmp_path):
     assert profile.intrinsics is not None
     lens = profile.intrinsics
     assert (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px) == (75.1, 75.2, 47.3, 31.7)
-    # landscape with the home button to the right: the phone's right side is up, its top to the left
+    # landscape with the home button on the right: the phone's right side is up, its top points to the left
     np.testing.assert_array_equal(profile.rotation_cam_imu @ [1, 0, 0], [0, -1, 0])
     np.testing.assert_array_equal(profile.rotation_cam_imu @ [0, 1, 0], [-1, 0, 0])
 
 
 def test_unknown_intrinsics_of_old_phones(tmp_path):
-    """1.00, 1.00, 0.50, 0.50 means that the phone does not say."""
+    """Intrinsics of 1.00, 1.00, 0.50, 0.50 are placeholders for unknown values."""
     write_objective_c(tmp_path / "rec", lens="1.00, 1.00, 0.50, 0.50")
     assert resolve_profile(read_capture(tmp_path / "rec"))[0].intrinsics is None
 
 
-def test_seconds_of_32_bits_are_made_exact_by_the_movie(tmp_path):
-    """Before June 2019 times fell on a grid of 8 ms; the movie's own steps take it away."""
+def test_32_bit_seconds_are_corrected_with_the_movie(tmp_path):
+    """Before June 2019 times were rounded to a grid of 8 ms; the movie's PTS remove the rounding."""
     stamps = write_objective_c(tmp_path / "rec", seconds=True)
     capture = read_capture(tmp_path / "rec")
     found = np.array([frame.timestamp_ns for frame in capture.frames])
     steps = np.diff(found) - np.diff(stamps)
-    assert np.abs(steps).max() < 12_000  # a tick of the movie
+    assert np.abs(steps).max() < 12_000  # one tick of the movie's clock
     assert abs(found[0] - stamps[0]) < 4_000_000
     assert capture.frames[5].exposure_s == pytest.approx(0.0083)
 
 
-def test_a_time_with_a_digit_too_many_costs_one_row(tmp_path):
-    """The app's fault in printing a fraction that rounds up is one row that leaps."""
+def test_a_time_with_an_extra_digit_drops_one_row(tmp_path):
+    """The app prints an extra digit if a fraction rounds up; only that row is dropped."""
     write_objective_c(tmp_path / "rec")
     path = tmp_path / "rec/gyro_accel.csv"
     lines = path.read_text().splitlines()
@@ -111,7 +114,7 @@ def test_a_time_with_a_digit_too_many_costs_one_row(tmp_path):
 
 @pytest.mark.parametrize("transposed", [False, True])
 def test_arkit_app(tmp_path, transposed):
-    """Spare rows belong to no frame, force is minus all acceleration, intrinsics are scaled to the movie."""
+    """Surplus rows are ignored, the specific force has the opposite sign, and intrinsics are scaled to the movie."""
     uptime_s = write_arkit(tmp_path / "rec", transposed=transposed)
     capture = read_capture(tmp_path / "rec")
     assert capture.kind == "MARSLogger for iOS (ARKit)"
@@ -126,8 +129,8 @@ def test_arkit_app(tmp_path, transposed):
     assert any(note.code == "stamps-slid" for note in capture.notes)
 
 
-def test_arkit_times_of_a_long_uptime_have_a_grid_of_a_millisecond(tmp_path):
-    """After 28 hours nine digits leave 1 ms; frames are exact by the movie, and the grid is said."""
+def test_arkit_times_after_a_long_uptime_are_coarse(tmp_path):
+    """After 28 hours, nine digits leave 1 ms. The movie makes frame times exact, and a note reports the grid."""
     uptime_s = write_arkit(tmp_path / "rec", uptime_s=912_345.678123, spare=0)
     capture = read_capture(tmp_path / "rec")
     assert any(note.code == "coarse-times" for note in capture.notes)
@@ -135,8 +138,8 @@ def test_arkit_times_of_a_long_uptime_have_a_grid_of_a_millisecond(tmp_path):
     assert len(capture.usable) == COUNT
 
 
-def test_faults_end_in_one_line(tmp_path):
-    """A missing movie, two movies, a movie of another recording, missing columns and swapped files are named."""
+def test_faulty_ios_folders_give_a_specific_error(tmp_path):
+    """A missing movie, two movies, another recording's movie, and missing files or columns."""
     stamps = write_objective_c(tmp_path / "a")
     (tmp_path / "a/other.mp4").write_bytes(b"x")
     with pytest.raises(VideoError, match=r"IMG_0042\.MOV, other\.mp4"):

@@ -1,4 +1,4 @@
-"""Sensor Logger, OpenCamera-Sensors and Stray Scanner: fixtures written from their documented formats."""
+"""Sensor Logger, OpenCamera-Sensors and Stray Scanner, with fixtures written from their documented formats."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ COUNT = 16
 EPOCH_MS = 1_770_510_090_123
 G = 9.80665
 RATES, FORCE = (0.1, -0.25, 0.75), (0.3, 9.7, -0.4)
-"""x, y, z of every sample: all different, so that a swap shows."""
+"""x, y, z of every sample; all differ, so that a swap shows."""
 
 
 def csv_rows(start_ns: int, order: str, values: tuple[float, float, float]) -> str:
-    """Rows time, seconds_elapsed and three axes in the given order, from a second before to two after."""
+    """Rows of time, seconds_elapsed and three axes in the given order, from 1 s before to 2 s after the start."""
     named = dict(zip("xyz", values, strict=True))
     times = range(start_ns - 10**9, start_ns + 2 * 10**9, 10**7)
     rows = [f"{t},{(t - start_ns) / 1e9:.9f},{','.join(str(named[axis]) for axis in order)}" for t in times]
@@ -30,7 +30,7 @@ def csv_rows(start_ns: int, order: str, values: tuple[float, float, float]) -> s
 
 @pytest.fixture
 def sensor_logger(tmp_path: Path) -> Path:
-    """An Android export: the axes stand in the app's order z, y, x."""
+    """An Android export with the axes in the app's order z, y, x."""
     folder = tmp_path / "2026-02-08_00-21-30"
     (folder / "Camera").mkdir(parents=True)
     write_film(folder / "Camera" / f"{EPOCH_MS}.mp4", COUNT)
@@ -42,7 +42,7 @@ def sensor_logger(tmp_path: Path) -> Path:
 
 
 def test_a_sensor_logger_export_is_read(sensor_logger: Path) -> None:
-    """Axes come by name, frames start where the movie's name says, and the offset is left to be found."""
+    """Axes are read by name, frames start at the time in the movie's name, and the offset stays unknown."""
     capture = read_capture(sensor_logger)
     assert capture.kind == "Sensor Logger"
     assert len(capture.usable) == COUNT
@@ -54,7 +54,7 @@ def test_a_sensor_logger_export_is_read(sensor_logger: Path) -> None:
 
 
 def test_ios_accelerations_change_their_sign(sensor_logger: Path) -> None:
-    """On iOS gravity is what is logged, not the force that is felt; without gravity's file two files make it up."""
+    """iOS logs gravity instead of the specific force. Without TotalAcceleration.csv, two other files are added."""
     (sensor_logger / "Metadata.csv").write_text("version,platform\n3,ios\n")
     np.testing.assert_allclose(read_capture(sensor_logger).imu.accel_m_s2[5], -np.array(FORCE))
     (sensor_logger / "TotalAcceleration.csv").unlink()
@@ -73,14 +73,14 @@ def test_ios_accelerations_change_their_sign(sensor_logger: Path) -> None:
         ("1770510090666860288", 1770510090666860288),
     ],
 )
-def test_a_movie_named_by_its_start_tells_it(stem: str, start_ns: int) -> None:
-    """Seconds, milliseconds and nanoseconds are told by their digits; other names tell nothing."""
+def test_the_start_time_is_read_from_the_movie_s_name(stem: str, start_ns: int) -> None:
+    """The number of digits distinguishes seconds, milliseconds and nanoseconds; other names give no start time."""
     assert named_start_ns(Path(f"{stem}.mp4")) == start_ns
     assert named_start_ns(Path("VID_0001.mp4")) is None
 
 
 def test_a_movie_without_a_start_begins_with_the_samples(sensor_logger: Path) -> None:
-    """A renamed movie is read all the same, and a note says what was assumed."""
+    """A renamed movie is still read, and a note states the assumption."""
     movie = sensor_logger / "Camera" / f"{EPOCH_MS}.mp4"
     movie.rename(movie.with_name("clip.mp4"))
     capture = read_capture(sensor_logger)
@@ -89,7 +89,7 @@ def test_a_movie_without_a_start_begins_with_the_samples(sensor_logger: Path) ->
 
 
 def test_a_gyroscope_file_without_axes_is_refused(sensor_logger: Path) -> None:
-    """A file of other columns is one line, not a wrong capture."""
+    """The error lists the file's columns."""
     (sensor_logger / "Gyroscope.csv").write_text("time,seconds_elapsed,a,b,c\n1,2,3,4,5\n")
     with pytest.raises(ImuError, match="columns are time, seconds_elapsed, a, b, c"):
         read_capture(sensor_logger)
@@ -100,7 +100,7 @@ def test_a_gyroscope_file_without_axes_is_refused(sensor_logger: Path) -> None:
 
 @pytest.fixture(params=["beside", "above"])
 def open_camera(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """The sensors' folder with the movie in it, and with the movie above under the sensors' name."""
+    """The sensors' folder with the movie inside it, or in the parent folder under the sensors' name."""
     folder = tmp_path / "20260208_002130"
     folder.mkdir()
     name, start_ns = "VID_20260208_002130", 5_000_000_000_000
@@ -116,7 +116,7 @@ def open_camera(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
 
 
 def test_an_opencamera_recording_is_read(open_camera: Path) -> None:
-    """Frames carry their own stamps on the sensors' clock; axes are Android's."""
+    """Frames have timestamps on the sensors' clock; axes are Android's."""
     capture = read_capture(open_camera)
     assert capture.kind == "OpenCamera-Sensors"
     assert len(capture.usable) == COUNT
@@ -126,8 +126,8 @@ def test_an_opencamera_recording_is_read(open_camera: Path) -> None:
     np.testing.assert_allclose(capture.imu.accel_m_s2[7], FORCE)
 
 
-def test_an_opencamera_folder_without_its_movie_says_which(open_camera: Path) -> None:
-    """The missing movie is named."""
+def test_the_error_for_an_opencamera_folder_names_the_missing_movie(open_camera: Path) -> None:
+    """The error gives the expected file name."""
     for movie in (*open_camera.glob("*.mp4"), *open_camera.parent.glob("VID_20260208*.mp4")):
         movie.unlink()
     with pytest.raises(VideoError, match=r"vid_20260208_002130\.mp4"):
@@ -138,7 +138,7 @@ def test_an_opencamera_folder_without_its_movie_says_which(open_camera: Path) ->
 
 
 def write_scan(folder: Path, gravity: float) -> Path:
-    """A scan whose accelerations have gravity of this size."""
+    """A scan whose accelerations have gravity of this magnitude."""
     folder.mkdir()
     start_s = 412.5
     steps = write_film(folder / "rgb.mp4", COUNT, width=128, height=96)
@@ -154,7 +154,7 @@ def write_scan(folder: Path, gravity: float) -> Path:
 
 @pytest.mark.parametrize("gravity", [1.0, G])
 def test_a_stray_scan_is_read(tmp_path: Path, gravity: float) -> None:
-    """Intrinsics come from the file, accelerations in g or m/s² come out as the force that is felt."""
+    """Intrinsics come from the file; accelerations in g or m/s² become specific force."""
     capture = read_capture(write_scan(tmp_path / "71de12f9", gravity))
     assert capture.kind == "Stray Scanner"
     assert len(capture.usable) == COUNT
@@ -167,14 +167,14 @@ def test_a_stray_scan_is_read(tmp_path: Path, gravity: float) -> None:
 
 
 def test_accelerations_without_gravity_are_not_used(tmp_path: Path) -> None:
-    """Values of no known unit are left out, and a note says so."""
+    """Values in an unknown unit are left out with a note."""
     capture = read_capture(write_scan(tmp_path / "scan", 0.05))
     assert not capture.imu.has_accelerometer
     assert "accel-implausible" in {note.code for note in capture.notes}
 
 
-def test_a_damaged_matrix_is_one_line(tmp_path: Path) -> None:
-    """Text, or the intrinsics of another picture, are refused."""
+def test_a_damaged_matrix_is_an_error(tmp_path: Path) -> None:
+    """Text, or intrinsics of another picture size, are rejected."""
     folder = write_scan(tmp_path / "scan", 1.0)
     for text, says in (("one, two\n", "not a 3 x 3 matrix"), ("9e4,0,1\n0,9e4,1\n0,0,1\n", "do not fit a 128x96")):
         (folder / "camera_matrix.csv").write_text(text)
@@ -182,8 +182,8 @@ def test_a_damaged_matrix_is_one_line(tmp_path: Path) -> None:
             read_capture(folder)
 
 
-def test_kinds_are_told_by_content(sensor_logger: Path, tmp_path: Path) -> None:
-    """A file of the name alone makes no capture of that kind."""
+def test_capture_kinds_are_recognised_by_content(sensor_logger: Path, tmp_path: Path) -> None:
+    """A file with the right name alone does not make a capture of that kind."""
     (sensor_logger / "Gyroscope.csv").write_text("t,x,y,z\n1,2,3,4\n")
     with pytest.raises(CaptureError, match="holds no movie"):
         choose_reader(sensor_logger)

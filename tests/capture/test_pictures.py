@@ -1,4 +1,4 @@
-"""Folders of pictures with stamps."""
+"""Folders of pictures with timestamps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from virest.errors import CaptureError, ClockError, VideoError
 
 
 def write_pictures(folder: Path, names: list[str]) -> list[np.ndarray]:
-    """Pictures of these names, PNG or lossless otherwise."""
+    """Write pictures with these names as PNG or another lossless format."""
     pictures = colour_pictures(len(names))
     for name, picture in zip(names, pictures, strict=True):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -29,7 +29,7 @@ def write_pictures(folder: Path, names: list[str]) -> list[np.ndarray]:
 
 
 def write_samples(folder: Path, name: str) -> None:
-    """The same samples as MARSLogger, EuRoC or TUM-VI write them."""
+    """The same samples in MARSLogger's, EuRoC's or TUM-VI's format."""
     rows = imu_rows(stamps(6)[0], stamps(6)[-1])
     separator, head = (" ", "# timestamp[ns] w a") if name.endswith(".txt") else (",", GYRO_7)
     (folder / name).write_text("\n".join([head, *(separator.join(map(str, (t, *v))) for t, v in rows)]) + "\n")
@@ -39,8 +39,8 @@ def write_samples(folder: Path, name: str) -> None:
     ("kind", "samples"),
     [("names", "imu.csv"), ("data", "gyro_accel.csv"), ("tum", "imu.txt"), ("order", "gyro_accel.csv")],
 )
-def test_every_way_of_saying_times_gives_the_same_capture(tmp_path, kind, samples):
-    """Names that are times, a list in ns, one in seconds, and stamps in order: the same frames."""
+def test_every_timestamp_format_gives_the_same_capture(tmp_path, kind, samples):
+    """Times in file names, a list in ns, a list in seconds, and timestamps in order give the same frames."""
     times = stamps(6)
     names = {
         "names": [f"{t}.png" for t in times],
@@ -69,16 +69,16 @@ def test_every_way_of_saying_times_gives_the_same_capture(tmp_path, kind, sample
         np.testing.assert_array_equal(picture, pictures[number])
 
 
-def test_stamps_in_order_need_one_picture_each(tmp_path):
-    """A picture too many makes it unclear which stamp is whose."""
+def test_timestamps_in_order_need_one_picture_each(tmp_path):
+    """With a surplus picture the assignment of timestamps is ambiguous."""
     write_pictures(tmp_path, [f"{k}.png" for k in range(7)])
     (tmp_path / "frame_timestamps.txt").write_text("\n".join(["Frame timestamp[nanosec]", *map(str, stamps(6))]) + "\n")
     with pytest.raises(ClockError, match=r"6 of 6 stamps.*7 pictures"):
         read_picture_list(tmp_path / "frame_timestamps.txt")
 
 
-def test_what_is_no_plain_file_is_left_alone(tmp_path):
-    """A pipe called like a picture does not hang, and a folder of none is refused."""
+def test_special_files_are_not_read_as_pictures(tmp_path):
+    """A pipe named like a picture does not hang, and a folder without pictures is rejected."""
     os.mkfifo(tmp_path / "1.png")
     with pytest.raises(VideoError):
         read_picture_list(tmp_path)
@@ -87,8 +87,8 @@ def test_what_is_no_plain_file_is_left_alone(tmp_path):
         read_capture(tmp_path)
 
 
-def test_a_picture_that_promises_too_much_is_not_decoded(tmp_path):
-    """A few bytes cannot ask for the memory of a picture of 40000 x 40000."""
+def test_a_picture_that_claims_a_huge_size_is_not_decoded(tmp_path):
+    """A few bytes cannot request the memory of a picture of 40000 × 40000."""
     header = b"IHDR" + struct.pack(">IIBBBBB", 40_000, 40_000, 8, 2, 0, 0, 0)
     chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
     (tmp_path / "5.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)

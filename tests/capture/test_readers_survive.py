@@ -1,4 +1,4 @@
-"""Whatever a file holds, a reader answers: with what is there, or with one line."""
+"""Whatever a file contains, a reader returns a result or a one-line error."""
 
 import tempfile
 from collections.abc import Callable
@@ -59,7 +59,7 @@ VALUES = st.recursive(
 
 
 def answers(reader: Callable[[Path], Any], name: str, data: bytes) -> None:
-    """Read a file with these bytes; an error of the tree, of one line, is an answer."""
+    """Read a file with these bytes; a one-line VirestError is accepted."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(data)
@@ -73,7 +73,7 @@ def answers(reader: Callable[[Path], Any], name: str, data: bytes) -> None:
 @SHORT
 @given(rows=st.one_of(ROWS, FULL_ROWS), with_header=st.booleans(), end=st.sampled_from(["\n", "\r\n", "\r", ""]))
 def test_tables_of_any_rows(name: str, rows: list[str], *, with_header: bool, end: str) -> None:
-    """Numbers that overflow, quotes, other alphabets' digits, rows too short and too long."""
+    """Overflowing numbers, quotes, digits of other scripts, and rows that are too short or too long."""
     header, reader = HEADERS[name]
     text = (end or "\n").join([header, *rows] if with_header else rows) + end
     answers(reader, name, text.encode("utf-8", "surrogatepass"))
@@ -82,14 +82,14 @@ def test_tables_of_any_rows(name: str, rows: list[str], *, with_header: bool, en
 @SHORT
 @given(name=st.sampled_from(sorted(HEADERS)), data=st.binary(max_size=300))
 def test_tables_of_any_bytes(name: str, data: bytes) -> None:
-    """What is no text at all."""
+    """Bytes that are not text."""
     answers(HEADERS[name][1], name, data)
 
 
 @SHORT
 @given(content=st.dictionaries(KEYS, VALUES, max_size=6), cut=st.integers(0, 40))
 def test_profiles_and_settings_of_any_values(content: dict[str, Any], cut: int) -> None:
-    """Known keys with whatever behind them, whole and cut."""
+    """Known keys with arbitrary values, complete and truncated."""
     import yaml
 
     data = yaml.safe_dump(content, allow_unicode=True).encode("utf-8", "surrogatepass")
@@ -100,8 +100,8 @@ def test_profiles_and_settings_of_any_values(content: dict[str, Any], cut: int) 
 
 @SHORT
 @given(content=VALUES, tail=st.binary(max_size=10))
-def test_the_state_of_a_run_of_any_json(content: Any, tail: bytes) -> None:
-    """A run's request and logs that somebody else has written."""
+def test_run_state_files_of_any_json(content: Any, tail: bytes) -> None:
+    """A run's request and logs written by another program."""
     import json
 
     with tempfile.TemporaryDirectory() as folder:
@@ -134,7 +134,7 @@ def read_movie(path: Path) -> None:
     cut=st.one_of(st.just(0), st.integers(1, 3000)),
 )
 def test_movies_with_any_bytes_changed(small_movie: bytes, edits: list[tuple[int, bytes]], cut: int) -> None:
-    """Boxes, tables and pictures overwritten, and the file cut."""
+    """Boxes, tables and frames are overwritten, and the file is truncated."""
     data = bytearray(small_movie)
     for place, piece in edits:
         start = place % len(data)

@@ -1,4 +1,4 @@
-"""ROS 1 and 2 bags and MCAP files become captures, without ROS."""
+"""ROS 1 and ROS 2 bags and MCAP files become captures without ROS."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def messages(store: object, encoding: str) -> list[tuple[str, str, int, object]]
 
 
 def write_bag(path: Path, kind: str, encoding: str) -> Path:
-    """A bag of this kind; returns what a user would name."""
+    """A bag of this kind; returns the path that a user would give."""
     store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
     if kind == "ros1":
         writer = rosbag1.Writer(path.with_suffix(".bag"))
@@ -99,7 +99,7 @@ def write_bag(path: Path, kind: str, encoding: str) -> Path:
 
 @pytest.mark.parametrize(("kind", "encoding"), [("ros1", "bgr8"), ("ros2", "rgb8"), ("mcap", "jpeg")])
 def test_a_bag_becomes_a_capture(tmp_path: Path, kind: str, encoding: str) -> None:
-    """Pixels, header times, samples and lens come through; what a bag does not say stays unknown."""
+    """Pixels, header times, samples and lens are the same; values that a bag does not contain stay unknown."""
     bag = write_bag(tmp_path / "walk", kind, encoding)
     facts, text = run_import(bag, ImportOptions(tmp_path / "out"))
     assert (facts["frames"], facts["samples"], facts["image"]) == (COUNT, 120, "/cam/image_raw")
@@ -120,8 +120,8 @@ def test_a_bag_becomes_a_capture(tmp_path: Path, kind: str, encoding: str) -> No
     assert not profile.readout_known
 
 
-def test_an_import_never_replaces_what_is_not_its_own(tmp_path: Path) -> None:
-    """An existing folder is refused; --overwrite replaces an earlier import only."""
+def test_an_import_replaces_only_an_earlier_import(tmp_path: Path) -> None:
+    """An existing folder is rejected; ``overwrite`` replaces only an unchanged earlier import."""
     bag = write_bag(tmp_path / "walk", "ros1", "rgb8")
     run_import(bag, ImportOptions(tmp_path / "out"))
     with pytest.raises(OutputError, match="exists already"):
@@ -134,15 +134,15 @@ def test_an_import_never_replaces_what_is_not_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["ros1", "ros2"])
-def test_a_bag_in_place_of_a_capture_says_what_to_do(tmp_path: Path, kind: str) -> None:
-    """The command that unpacks it is named."""
+def test_the_error_for_a_bag_names_virest_import(tmp_path: Path, kind: str) -> None:
+    """A bag given as a capture is rejected with the command that converts it."""
     with pytest.raises(CaptureError) as caught:
         read_capture(write_bag(tmp_path / "walk", kind, "rgb8"))
     assert "virest import" in str(caught.value)
 
 
-def test_wrong_topics_and_damaged_bags_are_one_line(tmp_path: Path) -> None:
-    """A topic that is not there is answered by those that are; what is not a bag is said to be none."""
+def test_wrong_topics_and_damaged_bags_are_errors(tmp_path: Path) -> None:
+    """The error for a missing topic lists the existing ones; a damaged file cannot be read as a bag."""
     bag = write_bag(tmp_path / "walk", "ros1", "rgb8")
     with pytest.raises(CaptureError, match=r"no image topic /left.*/cam/image_raw"):
         run_import(bag, ImportOptions(tmp_path / "out", image="/left"))

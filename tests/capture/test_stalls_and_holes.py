@@ -1,4 +1,4 @@
-"""Encoder stalls in mid-movie, exposures that were not logged, and movies whose clock runs at its own rate."""
+"""Encoder stalls in the middle of a movie, unlogged exposures, and movies whose clock drifts."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from virest.errors import ClockError
 
 
 def codes(capture) -> set[str]:
-    """Short names of what is said of a capture."""
+    """Codes of a capture's notes."""
     return {note.code for note in capture.notes}
 
 
-def test_a_missing_metadata_row_takes_its_exposure_from_its_neighbours(tmp_path):
-    """Not zero: that would move the frame's middle; and the log says which frames it was."""
+def test_a_missing_exposure_is_interpolated(tmp_path):
+    """An exposure of zero would shift the frame's middle; a note names the frame."""
     writer = CaptureWriter(tmp_path / "c", exposure_ns="5000000")
     writer.write()
     lines = (writer.folder / "movie_metadata.csv").read_text().splitlines()
@@ -36,7 +36,7 @@ def test_a_missing_metadata_row_takes_its_exposure_from_its_neighbours(tmp_path)
 
 
 def test_repeats_long_after_the_start_are_a_stall(tmp_path):
-    """Frames about them may be later than their stamps and are left out; those far from them stay."""
+    """Frames around the repeats may lag their timestamps and are skipped; other frames stay."""
     writer = CaptureWriter(tmp_path / "c", count=110, repeats=(80, 83))
     capture = read_capture(writer.write())
     assert "encoder-stall" in codes(capture)
@@ -47,13 +47,13 @@ def test_repeats_long_after_the_start_are_a_stall(tmp_path):
 
 
 def test_a_phone_at_rest_repeats_without_a_stall(tmp_path):
-    """Pictures of a phone that does not turn may well be alike."""
+    """Frames of a phone that does not turn may be equal."""
     writer = CaptureWriter(tmp_path / "c", count=110, repeats=(80, 83), rate_rad_s=0.0)
     assert not read_capture(writer.write()).stalls
 
 
 def test_an_encoder_that_falls_behind_shows_in_the_unix_columns():
-    """For as long as it is late; an encoder that is always uneven is none that stalls."""
+    """A stall lasts as long as the encoder is late; an encoder that is always irregular has no stall."""
     lag_s = np.full(200, 0.110)
     lag_s[90:96] += [0.3, 0.25, 0.2, 0.15, 0.1, 0.02]
     assert find_stalls((), lag_s, 20, 1 / 30) == ((90, 94),)
@@ -61,7 +61,10 @@ def test_an_encoder_that_falls_behind_shows_in_the_unix_columns():
 
 
 def test_a_movie_that_runs_at_its_nominal_rate_joins_with_a_note(tmp_path):
-    """Constant 33.4 ms in the movie, stamps 33.401 ms apart: 99 µs in the end, where a lost frame is 33 ms."""
+    """Frames are 33.4 ms apart in the movie and 33.401 ms in the timestamps.
+
+    99 µs in the end, far less than a lost frame.
+    """
     writer = CaptureWriter(tmp_path / "c", count=100)
     writer.stamps_ns = [START_NS + k * (PERIOD_NS + 1000) for k in range(100)]
     writer.metadata_ns = [stamp + 437 for stamp in writer.stamps_ns]
@@ -73,8 +76,8 @@ def test_a_movie_that_runs_at_its_nominal_rate_joins_with_a_note(tmp_path):
 
 
 @pytest.mark.parametrize("spoiled", ["a step", "another rate"])
-def test_what_is_no_slow_drift_does_not_join_row_by_row(spoiled: str):
-    """One long step of the stamps, or a rate 3 % off, is another recording or a lost frame."""
+def test_only_a_slow_drift_is_joined_row_by_row(spoiled: str):
+    """A step in the timestamps or a rate error of 3 % indicates a lost frame or another recording."""
     pts = np.arange(60, dtype=np.int64) * PERIOD_NS
     stamps = pts + np.where(pts > pts[57], 3_000_000, 0) if spoiled == "a step" else (pts * 1.03).astype(np.int64)
     if spoiled == "a step":
@@ -84,8 +87,8 @@ def test_what_is_no_slow_drift_does_not_join_row_by_row(spoiled: str):
             align_frames(pts, stamps, pts_tolerance_ns(11_111.0))
 
 
-def test_inspect_counts_frames_and_shows_the_clocks_difference_of_any_source(tmp_path):
-    """`jq .frames` has something to show; a REALTIME source shifts nothing, and says what edge_epochs.txt holds."""
+def test_inspect_counts_frames_and_shows_the_clock_difference(tmp_path):
+    """A REALTIME source shifts nothing, but the difference in edge_epochs.txt is shown."""
     writer = CaptureWriter(tmp_path / "c")
     writer.write()
     source = "#Camera frame timestamp source according to CameraCharacteristics.SENSOR_INFO_TIMESTAMP_SOURCE is "

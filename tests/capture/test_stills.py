@@ -1,4 +1,4 @@
-"""Bracketed stills: exposure times from a CSV and from EXIF, and every fault of both."""
+"""Bracketed stills: exposure times from a CSV and from EXIF, and the errors of both."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from virest.errors import CaptureError
 
 def exif_block(order: str = "<", exposure: tuple[int, int] = (1, 125), f_number: tuple[int, int] = (18, 10),
                iso: int = 200) -> bytes:  # fmt: skip
-    """A TIFF block with an EXIF directory that holds exposure time, f-number and ISO."""
+    """A TIFF block with an EXIF directory of exposure time, f-number and ISO."""
     head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
     ifd0 = struct.pack(order + "HHHII I".replace(" ", ""), 1, 0x8769, 4, 1, 26, 0)
     values_at = 26 + 2 + 3 * 12 + 4
@@ -29,13 +29,13 @@ def exif_block(order: str = "<", exposure: tuple[int, int] = (1, 125), f_number:
 
 
 def with_exif(jpeg: bytes, block: bytes) -> bytes:
-    """A JPEG with an APP1 segment after its start."""
+    """A JPEG with an added APP1 segment."""
     body = b"Exif\0\0" + block
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
 
 
 def write_stills(folder: Path, count: int = 3, suffix: str = ".png", shape: tuple[int, int] = (24, 40)) -> list[str]:
-    """Pictures of random levels; their names."""
+    """Write pictures of random levels; return their names."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(2)
     names = [f"p{i}{suffix}" for i in range(count)]
@@ -46,7 +46,7 @@ def write_stills(folder: Path, count: int = 3, suffix: str = ".png", shape: tupl
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_exif_is_read_in_both_byte_orders(order: str) -> None:
-    """From a JPEG, from a TIFF, and from a PNG's chunk."""
+    """EXIF is read from a JPEG, from a TIFF, and from a PNG chunk."""
     truth = ExifExposure(0.008, 1.8, 200.0)
     block = exif_block(order)
     jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
@@ -56,8 +56,8 @@ def test_exif_is_read_in_both_byte_orders(order: str) -> None:
         assert read_exif_exposure(data) == truth
 
 
-def test_damaged_exif_reads_as_not_said() -> None:
-    """Every cut and many flipped bytes of a JPEG's head: no error, no endless loop, no nonsense values."""
+def test_damaged_exif_gives_no_exposure() -> None:
+    """Truncated or corrupted JPEG headers give no error, no endless loop and no invalid value."""
     jpeg = with_exif(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes(), exif_block())
     rng = np.random.default_rng(0)
     for cut in range(0, 130):
@@ -73,7 +73,7 @@ def test_damaged_exif_reads_as_not_said() -> None:
 
 
 def test_a_bracket_takes_its_exposures_from_exif(tmp_path: Path) -> None:
-    """Light counts ISO and f-number too, relative to the first picture."""
+    """ISO and f-number also count, relative to the first picture."""
     write_stills(tmp_path, 2, ".jpg")
     for i, block in enumerate((exif_block(), exif_block(exposure=(1, 60), iso=400, f_number=(36, 10)))):
         path = tmp_path / f"p{i}.jpg"
@@ -86,7 +86,7 @@ def test_a_bracket_takes_its_exposures_from_exif(tmp_path: Path) -> None:
 
 
 def test_a_bracket_takes_its_exposures_from_a_csv(tmp_path: Path) -> None:
-    """Spaces, column order and an unlisted picture are no matter; colours come as RGB."""
+    """Spaces, column order and an unlisted picture do not matter; colours are read as RGB."""
     names = write_stills(tmp_path)
     picture = np.zeros((24, 40, 3), np.uint8)
     picture[..., 2] = 200
@@ -99,8 +99,8 @@ def test_a_bracket_takes_its_exposures_from_a_csv(tmp_path: Path) -> None:
     assert "p1.png" in notes[0]
 
 
-def test_16_bits_keep_their_fractions(tmp_path: Path) -> None:
-    """Levels 0 to 255 as float; 65535 is 255."""
+def test_16_bit_levels_keep_their_fractions(tmp_path: Path) -> None:
+    """Levels are floats from 0 to 255; 65535 is 255."""
     cv2.imwrite(str(tmp_path / "a.png"), np.full((10, 12, 3), 12345, np.uint16))
     (tmp_path / "t.csv").write_text("file,exposure_s\na.png,1\n")
     stills, _ = read_bracket(tmp_path, tmp_path / "t.csv")
@@ -129,7 +129,7 @@ def test_16_bits_keep_their_fractions(tmp_path: Path) -> None:
     ],
 )
 def test_faults_of_the_csv_are_named(tmp_path: Path, text: str, says: str) -> None:
-    """One short line with the place."""
+    """The one-line error names the line or the value."""
     write_stills(tmp_path)
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(CaptureError) as refusal:
@@ -140,10 +140,10 @@ def test_faults_of_the_csv_are_named(tmp_path: Path, text: str, says: str) -> No
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_a_damaged_picture_is_refused_without_the_decoder_s_own_words(
+def test_a_damaged_picture_is_refused_without_decoder_messages(
     tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Cut short, and with one bit wrong in the middle of a PNG: the error, and nothing else on standard error."""
+    """For a truncated file and a PNG with one wrong bit, the decoder prints nothing on standard error."""
     names = write_stills(tmp_path, 2, suffix)
     table = tmp_path / "t.csv"
     table.write_text("file,exposure_s\n" + "".join(f"{n},{i + 1}\n" for i, n in enumerate(names)))
@@ -157,8 +157,8 @@ def test_a_damaged_picture_is_refused_without_the_decoder_s_own_words(
     assert capfd.readouterr().err == ""
 
 
-def test_hidden_files_are_no_pictures(tmp_path: Path) -> None:
-    """What a Mac leaves beside each picture bears its suffix."""
+def test_hidden_files_are_ignored(tmp_path: Path) -> None:
+    """macOS leaves a hidden file with the same suffix beside each picture."""
     names = write_stills(tmp_path, 2)
     (tmp_path / f"._{names[0]}").write_bytes(b"\0\5\x16\7")
     table = tmp_path / "t.csv"
@@ -168,8 +168,8 @@ def test_hidden_files_are_no_pictures(tmp_path: Path) -> None:
     assert notes == []
 
 
-def test_folders_that_are_no_bracket_are_refused(tmp_path: Path) -> None:
-    """Missing, empty, no EXIF, damaged, of two sizes, and a CSV that is not there."""
+def test_invalid_brackets_are_refused(tmp_path: Path) -> None:
+    """A missing or empty folder, no EXIF, damaged pictures, two sizes, and a missing CSV."""
     with pytest.raises(CaptureError, match="no such folder"):
         read_bracket(tmp_path / "nowhere")
     with pytest.raises(CaptureError, match="no PNG"):
@@ -195,8 +195,8 @@ def test_folders_that_are_no_bracket_are_refused(tmp_path: Path) -> None:
         read_bracket(folder, table)
 
 
-def test_frames_of_one_exposure_are_taken_together(writer: CaptureWriter) -> None:
-    """Exposure × ISO decides: two settings of one product are one picture."""
+def test_frames_of_equal_exposure_are_averaged(writer: CaptureWriter) -> None:
+    """Frames are grouped by exposure × ISO: two settings with the same product give one picture."""
     writer.write()
     path = writer.folder / "movie_metadata.csv"
     head, *rows = path.read_text().splitlines()
@@ -216,7 +216,7 @@ def test_frames_of_one_exposure_are_taken_together(writer: CaptureWriter) -> Non
 
 
 def test_a_capture_without_exposures_is_refused(writer: CaptureWriter) -> None:
-    """Exit 4, with what to do."""
+    """The error states that no exposure is logged."""
     writer.write()
     (writer.folder / "movie_metadata.csv").unlink()
     with pytest.raises(CaptureError, match="no frame has a logged exposure"):

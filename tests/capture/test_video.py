@@ -1,4 +1,4 @@
-"""The movie: index, order, seeking, colour, damage."""
+"""The movie: index, order, seeking, colour and damage."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ STEPS = [i * 33_400_000 for i in range(24)]
 
 @pytest.fixture
 def movie(tmp_path: Path) -> Path:
-    """24 frames, key frame every ten."""
+    """24 frames with a key frame every 10."""
     write_movie(tmp_path / "movie.mp4", moving_pictures(24), STEPS)
     return tmp_path / "movie.mp4"
 
 
 def uniform_frame(y: int, u: int = 128, v: int = 128, pixel_format: str = "yuv420p") -> av.VideoFrame:
-    """One colour all over, 32x16."""
+    """A frame of one colour, 32 × 16."""
     frame = av.VideoFrame(32, 16, pixel_format)
     for plane, value in zip(frame.planes, (y, u, v), strict=True):
         plane.update(bytes([value]) * plane.buffer_size)
@@ -36,7 +36,7 @@ def uniform_frame(y: int, u: int = 128, v: int = 128, pixel_format: str = "yuv42
 
 
 def test_index_holds_size_times_and_key_frames(movie):
-    """The index has one entry a frame with its exact time, without decoding."""
+    """The index has one entry per frame with its exact time, without decoding."""
     index = probe_movie(movie)
     assert (index.width, index.height, len(index)) == (64, 96, 24)
     assert index.keyframes == (0, 10, 20)
@@ -44,8 +44,8 @@ def test_index_holds_size_times_and_key_frames(movie):
 
 
 @pytest.mark.parametrize("qp", [22, 28])
-def test_steps_of_the_quantiser_are_those_that_the_movie_was_coded_with(tmp_path, qp):
-    """Six QP more make twice the step; the pictures are the same whether it is asked for or not."""
+def test_quantiser_steps_are_those_of_the_encoder(tmp_path, qp):
+    """A QP larger by 6 doubles the step; frames are the same whether or not steps are requested."""
     path = tmp_path / "movie.mp4"
     write_movie(path, moving_pictures(4), STEPS[:4], qmin=str(qp), qmax=str(qp))
     index, steps = probe_movie(path), {}
@@ -55,8 +55,8 @@ def test_steps_of_the_quantiser_are_those_that_the_movie_was_coded_with(tmp_path
         np.testing.assert_array_equal(picture, told[number])
 
 
-def test_no_frame_stays_in_memory_until_python_looks_for_circles(tmp_path):
-    """Asking for the quantiser's steps leaves nothing behind: a frame's memory is free once the next one comes."""
+def test_no_frame_waits_for_the_garbage_collector(tmp_path):
+    """Reading quantiser steps leaves no reference cycle: a frame's memory is free once the next frame is read."""
     path = tmp_path / "movie.mp4"
     write_movie(path, moving_pictures(12), STEPS[:12])
     index = probe_movie(path)
@@ -72,7 +72,7 @@ def test_no_frame_stays_in_memory_until_python_looks_for_circles(tmp_path):
 
 
 def test_b_frames_come_in_presentation_order(tmp_path):
-    """With B-frames the index is sorted by time and each frame is still the one of its time."""
+    """With B-frames the index is sorted by time and each time has the right frame."""
     pictures = moving_pictures(24)
     write_movie(tmp_path / "movie.mp4", pictures, STEPS, bf="3", preset="veryfast", **{"b-adapt": "0"})
     index = probe_movie(tmp_path / "movie.mp4")
@@ -83,8 +83,8 @@ def test_b_frames_come_in_presentation_order(tmp_path):
         assert int(np.argmin(errors)) == number
 
 
-def test_seeking_gives_the_same_pictures(movie):
-    """A frame is the same whether reached from the start or by seeking, in runs or alone."""
+def test_seeking_gives_the_same_frames(movie):
+    """A frame is the same whether read from the start or by seeking, in runs or alone."""
     index = probe_movie(movie)
     whole = dict(read_frames(movie, index, 0, 23))
     assert list(whole) == list(range(24))
@@ -100,15 +100,15 @@ def test_seeking_gives_the_same_pictures(movie):
 
 
 def test_ends_are_clipped(movie):
-    """Frames beyond the movie are not asked for."""
+    """Frame numbers outside the movie are ignored."""
     index = probe_movie(movie)
     assert [number for number, _ in read_frames(movie, index, -3, 2)] == [0, 1, 2]
     assert [number for number, _ in read_frames(movie, index, 22, 99)] == [22, 23]
     assert not list(read_frames(movie, index, 30, 40))
 
 
-def test_damaged_frame_loses_itself_and_its_followers_only(movie):
-    """After a damaged packet frames are None up to the next key frame, then right again."""
+def test_a_damaged_frame_affects_only_its_group(movie):
+    """After a damaged packet, frames are None up to the next key frame, then right again."""
     index = probe_movie(movie)
     good = dict(read_frames(movie, index, 0, 23))
     with av.open(str(movie)) as container:
@@ -123,8 +123,8 @@ def test_damaged_frame_loses_itself_and_its_followers_only(movie):
     np.testing.assert_array_equal(seen[21], good[21])
 
 
-def test_cut_movie_keeps_what_is_there(tmp_path):
-    """A movie whose index is whole but whose data end early gives its first frames, then None."""
+def test_a_truncated_movie_keeps_its_first_frames(tmp_path):
+    """A movie with a complete index but truncated data gives its first frames, then None."""
     path = tmp_path / "movie.mp4"
     with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
         stream = container.add_stream("libx264", rate=30)
@@ -144,16 +144,16 @@ def test_cut_movie_keeps_what_is_there(tmp_path):
 
 
 @pytest.mark.parametrize("grey", [16, 17, 63, 126, 200, 235])
-def test_known_grey_has_no_bias(grey):
-    """A uniform limited-range grey comes out as its rounded full-range value in all three channels."""
+def test_a_known_grey_is_exact(grey):
+    """A uniform limited-range grey is converted to its rounded full-range value in all three channels."""
     frame = uniform_frame(grey)
     expected = round((grey - 16) * 255 / 219)
     assert set(np.unique(to_rgb(frame))) == {expected}
     assert set(np.unique(to_gray(frame))) == {expected}
 
 
-def test_mean_bias_over_all_greys_is_below_a_twentieth():
-    """Rounding, not truncation: over every code the mean error against exact arithmetic vanishes."""
+def test_the_mean_bias_over_all_greys_is_small():
+    """Values are rounded, not truncated: the mean error over all codes is below 0.02 levels."""
     codes = range(16, 236)
     errors = [to_rgb(uniform_frame(code)).mean() - (code - 16) * 255 / 219 for code in codes]
     assert abs(np.mean(errors)) < 0.02
@@ -164,7 +164,7 @@ def test_mean_bias_over_all_greys_is_below_a_twentieth():
 )
 @pytest.mark.parametrize("full_range", [False, True])
 def test_matrix_and_range_of_the_stream_are_used(matrix, kr, kb, full_range):
-    """Each matrix and range gives the colours of its defining equations; untagged is BT.601 limited."""
+    """Each matrix and range gives the colours of its defining equations; untagged video is BT.601."""
     frame = uniform_frame(120, 90, 160)
     frame.colorspace = matrix
     frame.color_range = 2 if full_range else 1
@@ -176,10 +176,10 @@ def test_matrix_and_range_of_the_stream_are_used(matrix, kr, kb, full_range):
     np.testing.assert_allclose(to_rgb(frame)[5, 7], np.clip([red, green, blue], 0, 255), atol=0.53)
 
 
-def test_colour_picture_survives_the_movie(tmp_path):
-    """A smooth colour picture comes back through 4:2:0 at better than 45 dB: chroma lies where it was put.
+def test_a_colour_picture_survives_chroma_subsampling(tmp_path):
+    """A smooth colour picture is reconstructed from 4:2:0 at better than 45 dB, since chroma is located correctly.
 
-    FFmpeg's scaler takes the mean of two columns, which lies between them.
+    FFmpeg's scaler averages two columns, so its chroma lies between them.
     """
     y, x = np.mgrid[:128, :160]
     channels = [128 + 100 * np.sin(x / 6), 128 + 100 * np.sin(y / 7 + 1), 128 + 90 * np.sin((x + y) / 9)]
@@ -193,7 +193,10 @@ def test_colour_picture_survives_the_movie(tmp_path):
 @pytest.mark.parametrize("centred", [False, True])
 @pytest.mark.parametrize("along", [0, 1])
 def test_colour_detail_keeps_its_contrast(along: int, centred: bool):
-    """Waves of 8 px across rows or columns, sampled where the chroma lies: linear interpolation leaves 85 % of them."""
+    """Waves of 8 px across rows or columns keep amplitude and phase.
+
+    Linear interpolation would keep 85 % of the amplitude.
+    """
     at = np.arange(0, 128, 2) + (0.5 if centred or along == 0 else 0.0)
     wave = 40 * np.sin(2 * np.pi * at / 8)
     chroma = np.rint(128 + (np.tile(wave[:, None], 64) if along == 0 else np.tile(wave, (64, 1)))).astype(np.uint8)
@@ -210,34 +213,34 @@ def test_colour_detail_keeps_its_contrast(along: int, centred: bool):
     waves = np.exp(-2j * np.pi * position / 8)
     expected = 40 * 2 * (1 - 0.299) * 255 / 224
     assert 2 * np.abs(shown @ waves) / len(position) == pytest.approx(expected, rel=0.06)
-    assert np.angle(shown @ waves) == pytest.approx(-np.pi / 2, abs=0.02), "and its place"
+    assert np.angle(shown @ waves) == pytest.approx(-np.pi / 2, abs=0.02), "the phase is kept as well"
 
 
 def test_odd_sizes_keep_their_shape():
-    """An odd side has a chroma sample of its own, cut after doubling."""
+    """The last chroma sample of an odd side is cut after upsampling."""
     frame = av.VideoFrame.from_ndarray(np.full((15, 33, 3), 77, np.uint8), format="rgb24").reformat(format="yuv420p")
     assert to_rgb(frame).shape == (15, 33, 3)
     assert to_gray(frame).shape == (15, 33)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a movie", b"#EXTM3U\nhttp://localhost/x\n", bytes(5000)])
-def test_what_is_no_movie_is_refused(tmp_path, content):
-    """Empty files, text, playlists and zeros get one clear line."""
+def test_a_file_that_is_not_a_movie_is_refused(tmp_path, content):
+    """Empty files, text, playlists and zeros give an error that names the file."""
     path = tmp_path / "movie.mp4"
     path.write_bytes(content)
     with pytest.raises(VideoError, match=r"movie\.mp4"):
         probe_movie(path)
 
 
-def test_movie_without_its_index_is_refused(movie):
-    """A movie cut before its moov box says what that means."""
+def test_a_movie_without_its_index_is_refused(movie):
+    """The error for a movie cut before its moov box explains the likely cause."""
     movie.write_bytes(movie.read_bytes()[:2000])
     with pytest.raises(VideoError, match="stopped cleanly"):
         probe_movie(movie)
 
 
-def test_sound_without_pictures_is_refused(tmp_path):
-    """A file with an audio stream alone has no video."""
+def test_a_movie_without_video_is_refused(tmp_path):
+    """A file with only an audio stream is an error."""
     path = tmp_path / "movie.mp4"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("aac", rate=48_000)
@@ -249,15 +252,15 @@ def test_sound_without_pictures_is_refused(tmp_path):
         probe_movie(path)
 
 
-def test_absurd_size_is_refused(movie, monkeypatch):
-    """A picture larger than any camera's is refused before memory is asked for."""
+def test_an_implausible_frame_size_is_refused(movie, monkeypatch):
+    """A frame larger than any camera's is rejected before memory is allocated."""
     monkeypatch.setattr(video, "MAX_SIDE_PX", 90)
     with pytest.raises(VideoError, match="64x96"):
         probe_movie(movie)
 
 
 def test_pipe_and_folder_do_not_hang(tmp_path):
-    """A named pipe or a folder in the movie's place is refused at once."""
+    """A named pipe or a folder in place of the movie is rejected at once."""
     os.mkfifo(tmp_path / "movie.mp4")
     with pytest.raises(VideoError, match="not a regular file"):
         probe_movie(tmp_path / "movie.mp4")

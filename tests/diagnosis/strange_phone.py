@@ -1,4 +1,4 @@
-"""Phones with effects that no catalogue has: tracks without pictures, by a physics of their own."""
+"""Phones with effects outside the catalogue: synthetic tracks with their own physics."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Strange:
-    """What is strange about a phone; times on its inertial clock."""
+    """The unusual effects of a phone; times are on its inertial clock."""
 
     late_s: Callable[[Array], Array] | None = None
-    """Of the fraction of the readout: how much later than evenly a row starts."""
+    """Delay of a row's start relative to an even readout, by the fraction of the readout."""
     longer: Callable[[Array], Array] | None = None
-    """Of time: by which part the focal length is longer."""
+    """Relative increase of the focal length, by time."""
     tangential: tuple[float, float] = (0.0, 0.0)
     """p1 and p2 of the lens."""
     gyro: Callable[[Array, Array, Array], Array] | None = None
-    """Of time, reading and force: what is logged."""
+    """The logged rate, by time, reading and specific force."""
     focus_dioptres: Callable[[Array], Array] | None = None
     late_in_frame_s: Callable[[Array, Array], Array] | None = None
-    """Of the fraction of the readout and of the stamp: how much later a row of that frame starts."""
+    """Delay of a row's start, by the fraction of the readout and the frame's timestamp."""
     shifted_px: Callable[[Array, Array], Array] | None = None
-    """Of the place from the principal point, px, and of time: how far from there a point is seen."""
+    """Shift of a point in px, by its position relative to the principal point and by time."""
 
 
 class StrangePhone(Recording):
-    """A recording by a strange phone, of a scene far away."""
+    """A recording by an unusual phone, of a distant scene."""
 
     def __init__(self, setup: Setup, strange: Strange) -> None:
         super().__init__(setup)
@@ -45,14 +45,14 @@ class StrangePhone(Recording):
 
     @cached_property
     def imu(self) -> ImuSamples:
-        """The log, with what is strange about the gyroscope."""
+        """The log, including the gyroscope's unusual effects."""
         whole = Recording.imu.func(self)  # type: ignore[attr-defined]
         if self.strange.gyro is None:
             return whole
         return replace(whole, gyro_rad_s=self.strange.gyro(whole.time_s, whole.gyro_rad_s, whole.accel_m_s2))
 
     def seen_s(self, points_px: Array, frame: NDArray[np.intp]) -> Array:
-        """Rows that start late are seen late."""
+        """Points in delayed rows are seen later."""
         even_s = super().seen_s(points_px, frame)
         fraction = points_px[:, 1] / self.setup.height
         if self.strange.late_in_frame_s is not None:
@@ -72,7 +72,7 @@ class StrangePhone(Recording):
 
     @property
     def capture(self) -> Capture:
-        """The log beside the pictures that were never taken."""
+        """The log as a capture without a movie."""
         focus = self.strange.focus_dioptres
         frames = tuple(
             Frame(k, 0, float(t), float(e), focus_dioptres=None if focus is None else float(focus(np.array(t))))

@@ -1,4 +1,4 @@
-"""Fields of blur, from widths of edges that were never measured: what is added comes back, and nothing else does."""
+"""Fields of blur from synthetic edge widths: an added blur is recovered, and nothing else is reported."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ FRAMES, EACH = 40, 40
 
 
 def focus_dioptres(time_s: Array) -> Array:
-    """There and back."""
+    """A change of focus and back."""
     return 0.5 + 2 * np.exp(-(((time_s - 1.3) / 0.4) ** 2))
 
 
 def seen(added_px: Array | float, seed: int = 5) -> tuple[BlurObservations, Capture]:
-    """Widths with a Gaussian of this size on top, and the log beside them."""
+    """Edge widths with an added Gaussian blur of this size, and the log."""
     rng = np.random.default_rng(seed)
     count = FRAMES * EACH
     frame = np.repeat(np.arange(FRAMES), EACH)
@@ -61,15 +61,15 @@ WHEN = np.repeat(STAMPS, EACH)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_edges_of_one_width_have_no_field(seed: int) -> None:
-    """No false alarm: none from an even defocus, and none from what a lens and an encoder do to corners."""
+def test_normal_edge_widths_give_no_field(seed: int) -> None:
+    """Neither even defocus nor the usual softening of corners by lens and encoder raises a false alarm."""
     for added in (0.0, 1.2, 0.5 * (RADIUS / 350) ** 2):
         observations, capture = seen(added, seed)
         assert blur_field(observations, CAMERA, integrate_gyro(STILL, CAMERA), capture) is None
 
 
-def test_corners_that_are_soft_are_a_field_over_the_radius_that_kernels_follow() -> None:
-    """Each tile has its own; with the field in the profile there is nothing left to find."""
+def test_soft_corners_give_a_field_over_the_radius() -> None:
+    """Each tile's kernel includes the field; with the field in the profile no further field is found."""
     observations, capture = seen(1.5 * (RADIUS / 350) ** 2)
     found = blur_field(observations, CAMERA, integrate_gyro(STILL, CAMERA), capture)
     assert found is not None
@@ -91,8 +91,8 @@ def test_corners_that_are_soft_are_a_field_over_the_radius_that_kernels_follow()
     assert blur_field(observations, profile, trajectory, capture) is None
 
 
-def test_a_focus_that_moves_is_a_field_that_each_frame_follows() -> None:
-    """A few soft frames are told, with the log of the focus as their rival or cause; kernels of a frame have it."""
+def test_a_moving_focus_gives_a_field_over_time() -> None:
+    """A few defocused frames are found with and without a log of the focus, and a frame's kernels include the blur."""
     soft = 2.0 * (focus_dioptres(WHEN) - 0.5) / 2
     observations, capture = seen(soft)
     trajectory = integrate_gyro(STILL, CAMERA)
@@ -107,8 +107,8 @@ def test_a_focus_that_moves_is_a_field_that_each_frame_follows() -> None:
     assert finding.covariates == ("time",)
 
 
-def test_a_blur_comes_on_top_of_an_even_defocus() -> None:
-    """Variances add up."""
+def test_a_blur_field_adds_to_an_even_defocus() -> None:
+    """The variances add."""
     blur = Field("blur", ("time",), ((0.0, 1.0),), ((0.0,), (2.0,)), (), 0)
     even = replace(CAMERA, extensions=replace(CAMERA.extensions, defocus_sigma_px=1.5))
     motion = row_motion(integrate_gyro(STILL, CAMERA), even.with_fields([blur]), 1.0, 0.004)

@@ -1,4 +1,4 @@
-"""Every cause that can be hidden can be found."""
+"""Every cause that the simulator can hide can be diagnosed."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from virest.effects.table import EFFECTS as CATALOGUE
 from virest.simulation.effects import EFFECTS
 
 SPECIAL = {"scene_depth", "frame_lag"}
-"""Judged with the points, without being a term of their fit: a plane, and other stamps."""
+"""Judged with the points but not fitted as terms: a plane, and other timestamps."""
 
 
-def test_the_simulator_hides_what_the_catalogue_names_and_nothing_else() -> None:
-    """25 effects on both sides."""
+def test_the_simulator_and_the_catalogue_have_the_same_effects() -> None:
+    """Both have the same 25 effects."""
     assert set(EFFECTS) == set(CATALOGUE)
     assert len(CATALOGUE) == 25
 
 
-def test_every_named_cause_has_somebody_who_looks_for_it() -> None:
-    """Points, brightness, blur and edges share the catalogue between them; exposures that vary move points too."""
+def test_every_cause_of_the_catalogue_has_a_test() -> None:
+    """Points, brightness, blur and edges cover the catalogue. Varying exposures also move points."""
     points = {effect.name for effect in GEOMETRIC_EFFECTS} - {"exposure_time"} | SPECIAL
     light = {effect.name for effect in (RESPONSE_GAMMA, BLACK_LEVEL, VIGNETTING, Flicker())} | {"gain_drift"}
     blur = {effect().name for effect in (ExposureTime, Defocus)}
@@ -31,5 +31,5 @@ def test_every_named_cause_has_somebody_who_looks_for_it() -> None:
 
 
 def test_a_cause_is_the_same_in_another_process() -> None:
-    """Its functions stay where they are; its name goes."""
+    """A cause is pickled by its name, without its functions."""
     assert all(pickle.loads(pickle.dumps(effect)) is effect for effect in GEOMETRIC_EFFECTS)

@@ -1,4 +1,4 @@
-"""Sharpening is found by the overshoot beside edges, and told from what else shapes an edge."""
+"""Sharpening is found by the overshoot at edges and distinguished from other effects on edges."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from virest.simulation.phone_isp import PhoneIsp
 
 
 def edges(rng, shape, count=600, widths=(0.6, 1.4)):
-    """Edges of a scene in 24 frames: some sharper, some softer, with a decoded movie's noise."""
+    """Edges of a scene in 24 frames with different widths and the noise of a decoded movie."""
     profile = np.stack([shape(width) for width in rng.uniform(*widths, count)])
     noise = np.repeat(0.02 * rng.standard_normal((count, (len(GRID_PX) + 3) // 4)), 4, axis=1)[:, : len(GRID_PX)]
     rising = np.maximum.accumulate(profile, axis=1)
@@ -34,15 +34,15 @@ def edges(rng, shape, count=600, widths=(0.6, 1.4)):
 
 
 def found(rng, shape, **kind) -> Sharpening:
-    """What the fit makes of them."""
+    """The fit of these edges."""
     result = fit_sharpening(edges(rng, shape, **kind))
     assert result is not None
     return result
 
 
 @pytest.mark.parametrize(("amount", "radius_px"), [(0.8, 1.6), (1.5, 1.1)])
-def test_amount_and_radius_come_back_within_their_deviations(rng, amount, radius_px):
-    """Two and a half of them; the mask predicts held-out blocks better, and the deviations say something."""
+def test_amount_and_radius_are_recovered(rng, amount, radius_px):
+    """Errors lie within 2.5 deviations, which are small, and the mask predicts held-out blocks better."""
     seen = found(rng, lambda width: sharpened_step(width, amount, radius_px))
     assert seen.p_value < MAX_P
     assert abs(seen.amount - amount) < 2.5 * seen.amount_std < 2.5 * amount
@@ -51,8 +51,8 @@ def test_amount_and_radius_come_back_within_their_deviations(rng, amount, radius
 
 
 @pytest.mark.parametrize("soft_px", [0.0, 1.5])
-def test_defocus_and_curve_overshoot_nowhere(rng, soft_px):
-    """A step in light, defocused or not, behind a curve of gamma 2: no sharpening, at the stated rate of alarms."""
+def test_defocus_and_response_curve_are_not_sharpening(rng, soft_px):
+    """A step in light, defocused or not, with a curve of gamma 2 gives no sharpening."""
 
     def bent(width):
         grey = np.sqrt(0.05 + 0.6 * ndtr(GRID_PX / np.hypot(width, soft_px)))
@@ -64,8 +64,8 @@ def test_defocus_and_curve_overshoot_nowhere(rng, soft_px):
         assert found(rng, bent).p_value > 100 * MAX_P
 
 
-def test_a_scene_that_has_lines_beside_its_edges_is_not_sharpened(rng):
-    """Bright seams, as of print on glossy paper: an unsharp mask overshoots on both sides alike."""
+def test_bright_lines_beside_edges_are_not_sharpening(rng):
+    """An unsharp mask overshoots on both sides of an edge, unlike a bright seam, as of print on glossy paper."""
 
     def seamed(width):
         return ndtr(GRID_PX / width) + 0.12 * np.exp(-0.5 * ((GRID_PX - 2.0) / 0.8) ** 2)
@@ -74,8 +74,8 @@ def test_a_scene_that_has_lines_beside_its_edges_is_not_sharpened(rng):
 
 
 @pytest.mark.parametrize("texture", [0.1, 0.3])
-def test_surfaces_that_are_brighter_beside_some_edges_are_not_sharpened(texture):
-    """As many edges overshoot as fall short; those that overshoot are the steepest, which must not be taken for all."""
+def test_texture_beside_edges_is_not_sharpening(texture):
+    """Overshoot and undershoot are equally frequent; the steepest edges, which overshoot, do not represent all."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
 
@@ -88,21 +88,21 @@ def test_surfaces_that_are_brighter_beside_some_edges_are_not_sharpened(texture)
         assert found(rng, textured, widths=(0.7, 0.9)).p_value > 0.01
 
 
-def test_one_place_seen_in_many_frames_counts_once(rng):
-    """A board's one bright rim in all frames: as sure as one place can make it, and that is not sure."""
+def test_one_edge_seen_in_many_frames_counts_once(rng):
+    """The bright rim of one object in all frames is not sufficient evidence."""
     seen = edges(rng, lambda width: sharpened_step(width, 0.6, 1.2))
     one = replace(seen, place=np.zeros(len(seen), int))
     assert fit_sharpening(seen) is not None
     assert fit_sharpening(one) is None
 
 
-def test_few_edges_tell_nothing(rng):
-    """Rather no answer than one from twenty edges."""
+def test_few_edges_give_no_result(rng):
+    """Twenty edges are too few for a fit."""
     assert fit_sharpening(edges(rng, lambda width: ndtr(GRID_PX / width), count=20)) is None
 
 
 def opened(folder: Path, **options) -> tuple[Source, Trajectory]:
-    """Simulate a capture, and its motion by the capture's own profile."""
+    """Simulate a capture and integrate its motion with its own profile."""
     simulate_command(folder, width=480, height=360, frames=20, seed=3, exposure_ms=5.0, rate_rad_s=0.8,
                      truth_frames=False, **options)  # fmt: skip
     source = open_source(folder)
@@ -110,19 +110,19 @@ def opened(folder: Path, **options) -> tuple[Source, Trajectory]:
 
 
 def judged(source: Source, trajectory: Trajectory) -> PictureVerdict:
-    """What its edges say."""
+    """The verdict from the capture's edges."""
     return judge_sharpening(source.capture, source.profile, trajectory, source.gray)
 
 
 @pytest.fixture(scope="module")
 def processed(tmp_path_factory) -> tuple[Source, Trajectory]:
-    """A phone denoises in space and time, and sharpens; at the recorder's bit rate."""
+    """A capture by a phone that denoises in space and time and sharpens, at the recorder's bit rate."""
     isp = PhoneIsp(denoise=1.5, temporal_denoise=0.4)
     return opened(tmp_path_factory.mktemp("edges") / "phone", isp=isp, effects=["sharpening=0.9,1.4"])
 
 
-def test_a_hidden_sharpening_is_named_with_its_size(processed):
-    """From the movie alone, within two and a half deviations."""
+def test_a_hidden_sharpening_is_found_with_its_size(processed):
+    """Amount and radius are estimated from the movie alone, within 2.5 deviations."""
     (finding,) = judged(*processed).findings
     assert finding.name == "sharpening"
     for name, truth in (("amount", 0.9), ("radius_px", 1.4)):
@@ -132,8 +132,8 @@ def test_a_hidden_sharpening_is_named_with_its_size(processed):
     assert "unsharp" in finding.sentence
 
 
-def test_a_sharpening_among_the_estimates_is_no_new_cause(processed):
-    """As an extended profile records it; another mask than the recorded one is a change."""
+def test_a_sharpening_recorded_in_the_profile_is_not_a_new_cause(processed):
+    """An extended profile records it as an estimate; a different mask is a change."""
     source, trajectory = processed
     (first,) = judged(*processed).findings
     for factor, named in ((1.0, 0), (3.0, 1)):
@@ -147,8 +147,8 @@ def test_a_sharpening_among_the_estimates_is_no_new_cause(processed):
             assert finding.parameters["amount"].nominal == pytest.approx(3.0 * first.parameters["amount"].estimate)
 
 
-def test_sharpening_and_denoising_are_no_defocus_and_no_other_exposure(processed):
-    """Nothing is named by the widths of edges and the ratios of spectra."""
+def test_sharpening_and_denoising_are_not_reported_as_defocus_or_exposure(processed):
+    """Widths of edges and ratios of spectra give no finding."""
     source, trajectory = processed
     verdict, is_exposure = climb_blur(source.capture, source.profile, trajectory, source.gray, None)
     assert verdict.blur_rms_px is not None
@@ -156,8 +156,8 @@ def test_sharpening_and_denoising_are_no_defocus_and_no_other_exposure(processed
     assert not is_exposure
 
 
-def test_what_is_not_sharpened_is_not_named(tmp_path):
-    """Out of focus and under another curve: neither overshoots, and there are edges enough to tell."""
+def test_an_unsharpened_movie_gives_no_sharpening(tmp_path):
+    """Defocus and another response curve cause no overshoot, and there are enough edges to decide."""
     verdict = judged(*opened(tmp_path / "plain", scene="board", effects=["defocus=0.8", "response_curve=1.3"]))
     assert not verdict.findings
     assert not verdict.notes

@@ -1,4 +1,4 @@
-"""Effects that no catalogue has are described by the right covariate, shape and size, and nothing else is."""
+"""Effects outside the catalogue are described by the right covariate, shape and size, without false alarms."""
 
 from __future__ import annotations
 
@@ -41,22 +41,22 @@ PER_FORCE = np.array([[0.006, -0.003, 0.0045], [0.0015, 0.0075, -0.003], [-0.004
 
 
 def late_s(fraction):
-    """A parabola of the row, 2 ms in the middle."""
+    """A parabola over the row with a maximum of 2 ms."""
     return 0.008 * fraction * (1 - fraction)
 
 
 def warming(time_s):
-    """A focal length that settles 2 % longer."""
+    """A focal length that settles at a 2 % larger value."""
     return 0.02 * (1 - np.exp(-np.maximum(time_s, 0) / 0.7))
 
 
 def focus_dioptres(time_s):
-    """A refocus in the middle of the capture."""
+    """A change of focus in the middle of the capture."""
     return 0.5 + 2 / (1 + np.exp(-(time_s - 1.0) / 0.3))
 
 
 def filled(from_s, to_s):
-    """Readings lost and filled by a straight line."""
+    """Lost readings filled by linear interpolation."""
 
     def log(time_s, reading, _force):
         inside = np.flatnonzero((time_s >= from_s) & (time_s <= to_s))
@@ -70,7 +70,7 @@ def filled(from_s, to_s):
 def judged(
     phone: StrangePhone, nominal: CameraProfile, rungs: int = 0, fitted: tuple[Term, ...] = ()
 ) -> tuple[GeometricVerdict, list[FieldFinding]]:
-    """Fields after a ladder of some rungs, as a diagnosis requests them; fitted: terms in from the start."""
+    """Fields after a ladder of some rungs, as in a diagnosis; ``fitted`` lists terms included from the start."""
     capture, observed = phone.capture, phone.observed
     doubtful = doubtful_pairs(observed, capture, nominal)
     evidence = make_evidence(capture.imu, doubtful.for_ladder(observed), nominal)
@@ -84,7 +84,7 @@ def judged(
 
 
 def fitted_to(phone: StrangePhone) -> tuple[Evidence, TrackFit, TrackTable]:
-    """The phone's points as its profile predicts them."""
+    """The phone's points, fitted with its own profile."""
     evidence = make_evidence(phone.capture.imu, phone.observed)
     model = Model(phone.profile, None, ())
     table = evidence.table(model, 6000)
@@ -92,20 +92,20 @@ def fitted_to(phone: StrangePhone) -> tuple[Evidence, TrackFit, TrackTable]:
 
 
 def gained(field: FieldFinding) -> float:
-    """Part of the held-out excess over the true noise that a field takes away."""
+    """Part of the held-out excess over the true noise that a field removes."""
     before, after = (rms**2 - HAND.noise_px**2 for rms in (field.held_out.before, field.held_out.after))
     return 1 - after / before
 
 
 def error(found: FieldFinding, truth) -> float:
-    """Largest difference of a field from the truth over its range, as a part of the truth's range."""
+    """Largest difference between a field and the truth over its range, relative to the truth's range."""
     along = np.linspace(found.fields[0].knots[0][0], found.fields[0].knots[0][-1], 50)
     wanted = truth(along)
     return float(np.abs(found.fields[0].at(along)[:, 0] - wanted).max() / np.ptp(wanted))
 
 
-def test_rows_read_unevenly_are_a_delay_over_the_row() -> None:
-    """The parabola comes back, all that it cost is gained, and it stands in words."""
+def test_an_uneven_readout_is_a_delay_over_the_row() -> None:
+    """The parabola is recovered, removes most of the excess error, and is described in words."""
     phone = StrangePhone(HAND, Strange(late_s=late_s))
     verdict, (field,) = judged(phone, phone.profile)
     assert (field.kind, field.covariates, field.shape) == ("delay", ("row",), "a parabola")
@@ -117,7 +117,7 @@ def test_rows_read_unevenly_are_a_delay_over_the_row() -> None:
 
 
 def test_a_named_cause_beside_an_unknown_one_keeps_its_name_and_size() -> None:
-    """An offset of 6 ms beside uneven rows: both are found, neither takes the other's part."""
+    """An offset of 6 ms beside an uneven readout: both are found with their own sizes."""
     phone = StrangePhone(replace(HAND, seed=72), Strange(late_s=late_s))
     nominal = replace(phone.profile, time_offset_s=phone.setup.time_offset_s - 0.006)
     verdict, (field,) = judged(phone, nominal, rungs=1)
@@ -126,8 +126,8 @@ def test_a_named_cause_beside_an_unknown_one_keeps_its_name_and_size() -> None:
     assert error(field, late_s) < 0.1
 
 
-def test_a_lens_off_centre_is_a_map_of_second_order() -> None:
-    """Tangential distortion is neither taken for a principal point nor for k1."""
+def test_a_decentred_lens_is_a_second_order_map() -> None:
+    """Tangential distortion is not absorbed by the principal point or k1."""
     phone = StrangePhone(replace(HAND, seed=73), Strange(tangential=(0.012, -0.008)))
     verdict, (field,) = judged(phone, phone.profile, fitted=(PRINCIPAL_POINT, K1))
     lens = verdict.model.profile.intrinsics
@@ -141,8 +141,8 @@ def test_a_lens_off_centre_is_a_map_of_second_order() -> None:
     assert seen[1] == pytest.approx(truth, rel=0.15)
 
 
-def test_a_lens_hardly_off_centre_takes_its_two_numbers() -> None:
-    """A map of many numbers would not show it, nor does any cause."""
+def test_a_slightly_decentred_lens_is_described_by_two_parameters() -> None:
+    """A map with many parameters would not be significant, and no cause of the catalogue is."""
     phone = StrangePhone(replace(HAND, seed=98, points=40), Strange(tangential=(0.003, -0.002)))
     verdict, (field,) = judged(phone, phone.profile, rungs=2)
     assert not verdict.accepted
@@ -151,8 +151,11 @@ def test_a_lens_hardly_off_centre_takes_its_two_numbers() -> None:
 
 
 @pytest.mark.scenario
-def test_two_causes_that_only_compensate_for_a_lens_leave_together() -> None:
-    """A turned sensor and another principal point hide most of a strong tangential lens; beside the field both go."""
+def test_two_causes_that_compensate_for_a_lens_are_removed_together() -> None:
+    """A rotated sensor and another principal point absorb most of a strong tangential distortion.
+
+    With the field both are removed.
+    """
     phone = StrangePhone(replace(HAND, seed=83, frames=41), Strange(tangential=(0.012, -0.016)))
     verdict, (field,) = judged(phone, phone.profile, rungs=2)
     assert not verdict.accepted
@@ -161,7 +164,7 @@ def test_two_causes_that_only_compensate_for_a_lens_leave_together() -> None:
 
 
 def test_a_focal_length_that_settles_is_a_scale_over_time() -> None:
-    """It levels off, which a constant drift does not."""
+    """It levels off, unlike a constant drift."""
     phone = StrangePhone(replace(HAND, seed=74), Strange(longer=warming))
     _, (field,) = judged(phone, phone.profile)
     assert (field.kind, field.covariates, field.shape) == ("scale", ("time",), "levelling off")
@@ -169,8 +172,8 @@ def test_a_focal_length_that_settles_is_a_scale_over_time() -> None:
     assert error(field, warming) < 0.15
 
 
-def test_a_lens_that_breathes_runs_along_the_focus_and_names_time_as_its_rival() -> None:
-    """What goes together in a capture is said to."""
+def test_a_breathing_lens_is_a_scale_over_the_focus_with_time_as_rival() -> None:
+    """The report states that both covariates explain this capture equally well."""
     breathing = Strange(
         longer=lambda t: 0.02 * (focus_dioptres(t) - focus_dioptres(0.0)), focus_dioptres=focus_dioptres
     )
@@ -183,8 +186,8 @@ def test_a_lens_that_breathes_runs_along_the_focus_and_names_time_as_its_rival()
     assert not field.fields[0].belongs_to_one_capture
 
 
-def test_a_lens_goes_on_focusing_while_the_last_frame_is_read() -> None:
-    """Held at its last value, the log bent the last pair, which a curve over time then explained in its place."""
+def test_the_focus_log_extends_beyond_the_last_frame() -> None:
+    """The log is extrapolated over the readout of the last frame; a constant value would bias the last pair."""
     dioptres = Strange(focus_dioptres=lambda t: 0.5 + 0.3 * t)
     capture = StrangePhone(HAND, dioptres).capture
     times, values = np.array(focus_log(capture))
@@ -194,8 +197,8 @@ def test_a_lens_goes_on_focusing_while_the_last_frame_is_read() -> None:
     assert focus_log(StrangePhone(HAND, Strange()).capture) is None
 
 
-def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:
-    """The nine numbers come back with their signs."""
+def test_a_gyroscope_sensitive_to_gravity_is_a_rate_over_acceleration() -> None:
+    """All nine coefficients are recovered with their signs."""
     wall = replace(
         HAND, seed=76, sway_m=0.05, plane_per_m=(0.05, -0.1, 0.6), accel_bias_m_s2=(0.0, 0.0, 0.0)
     )  # fmt: skip
@@ -207,8 +210,8 @@ def test_a_gyroscope_that_feels_gravity_is_a_rate_over_acceleration() -> None:
     assert np.corrcoef(found.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
 
 
-def test_a_bias_measured_at_rest_stays_beside_a_sensitivity_to_gravity() -> None:
-    """Gravity is in a bias that was measured in the same pose; the field's rate at no force takes it out again."""
+def test_a_bias_measured_at_rest_stays_with_a_sensitivity_to_gravity() -> None:
+    """A bias measured in the same pose includes gravity; the field's rate at zero force subtracts it."""
     wall = replace(HAND, seed=76, sway_m=0.05, plane_per_m=(0.05, -0.1, 0.6), accel_bias_m_s2=(0.0, 0.0, 0.0))
     phone = StrangePhone(
         wall, Strange(gyro=lambda t, reading, force: reading + (force - force.mean(axis=0)) @ PER_FORCE.T)
@@ -222,8 +225,8 @@ def test_a_bias_measured_at_rest_stays_beside_a_sensitivity_to_gravity() -> None
 
 
 @pytest.mark.parametrize(("seed", "sway_m"), [(101, 0.1), (102, 0.25)], ids=["shaken", "at_4_g"])
-def test_a_wrong_focal_length_beside_it_keeps_its_name(seed: int, sway_m: float) -> None:
-    """A focal drift compensated for both before the field; forces beyond 2 g were taken for 2 g."""
+def test_a_wrong_focal_length_beside_a_sensitivity_to_gravity_is_named(seed: int, sway_m: float) -> None:
+    """The focal length is named rather than a focal drift, and forces up to 4 g are used."""
     wall = replace(HAND, seed=seed, sway_m=sway_m, plane_per_m=(0.05, -0.1, 0.35), accel_bias_m_s2=(0.0, 0.0, 0.0))
     phone = StrangePhone(wall, Strange(gyro=lambda t, reading, force: reading + force @ (0.6 * PER_FORCE).T))
     lens = phone.profile.intrinsics
@@ -237,8 +240,8 @@ def test_a_wrong_focal_length_beside_it_keeps_its_name(seed: int, sway_m: float)
     assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
 
 
-def test_a_bias_that_changes_at_an_instant_is_a_step() -> None:
-    """A curve through knots overshot at it: ten times the change, and a verdict that left most unexplained."""
+def test_a_sudden_change_of_bias_is_a_step() -> None:
+    """A smooth curve would overshoot at the step."""
     change = np.array([0.02, -0.015, 0.01])
     phone = StrangePhone(
         HAND, Strange(gyro=lambda t, reading, force: reading + np.where(t >= 1.13, 1.0, 0.0)[:, None] * change)
@@ -250,8 +253,8 @@ def test_a_bias_that_changes_at_an_instant_is_a_step() -> None:
     assert verdict.final_rms_px < 1.1 * HAND.noise_px
 
 
-def test_a_filled_gap_is_bridged_from_the_points() -> None:
-    """A straight line in the log is seen in the log, confirmed by the points, and replaced by what they tell."""
+def test_an_interpolated_gap_is_bridged_from_the_points() -> None:
+    """A straight line in the log is detected, confirmed by the points, and replaced by a rate estimated from them."""
     phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=filled(1.0, 1.15)))
     verdict, (field,) = judged(phone, phone.profile)
     assert isinstance(verdict.fields[0], Distrusted)
@@ -262,12 +265,12 @@ def test_a_filled_gap_is_bridged_from_the_points() -> None:
     assert gained(field) > 0.95
     assert "inertial rows there lie on a straight line" in field.sentence
     assert verdict.final_rms_px < 1.3 * HAND.noise_px
-    # under the profile with its bridge, the interval is no longer doubtful
+    # with the bridge in the profile, the interval is no longer doubtful
     assert not doubtful_pairs(phone.observed, phone.capture, verdict.model.profile).stretches
 
 
-def test_a_gyroscope_that_clips_is_found_at_its_limit() -> None:
-    """The limit is told, and the peaks are bridged."""
+def test_a_clipping_gyroscope_is_found_with_its_limit() -> None:
+    """The limit is reported, and the peaks are bridged."""
     phone = StrangePhone(replace(HAND, seed=78), Strange(gyro=lambda t, reading, _: np.clip(reading, -1.4, 1.4)))
     stretches = doubtful_stretches(phone.imu)
     assert {stretch.kind for stretch in stretches} == {"clipped"}
@@ -278,7 +281,7 @@ def test_a_gyroscope_that_clips_is_found_at_its_limit() -> None:
 
 
 class WholeRowsLost(StrangePhone):
-    """The accelerometer's readings are lost and filled too."""
+    """The accelerometer's readings are lost and interpolated too."""
 
     @cached_property
     def imu(self) -> ImuSamples:
@@ -289,7 +292,7 @@ class WholeRowsLost(StrangePhone):
 
 @pytest.mark.parametrize("phone_of", [StrangePhone, WholeRowsLost])
 def test_a_bridged_gap_does_not_turn_gravity_into_a_bias(phone_of: type[StrangePhone]) -> None:
-    """Without its bridge, a gap turns gravity for all later frames, and a gyroscope bias compensates for that."""
+    """Without its bridge, a gap rotates gravity in all later frames, and a gyroscope bias compensates for it."""
     wall = replace(HAND, seed=86, sway_m=0.1, plane_per_m=(0.05, -0.1, 0.4), accel_bias_m_s2=(0.0, 0.0, 0.0))
     phone = phone_of(wall, Strange(gyro=filled(0.9, 1.15)))
     nominal = replace(phone.profile, depth_m=None)
@@ -307,8 +310,8 @@ def test_a_bridged_gap_does_not_turn_gravity_into_a_bias(phone_of: type[StrangeP
     assert fits[1].scale < 1.1
 
 
-def test_a_gyroscope_that_clips_in_most_frames_is_bridged_in_all() -> None:
-    """Too few pairs are left for the ladder alone: with bridges it climbs on all of them, and finds nothing else."""
+def test_a_gyroscope_that_clips_in_most_frames_is_bridged() -> None:
+    """Too few pairs remain for the ladder; with bridges it uses all pairs and finds no other cause."""
     phone = StrangePhone(replace(HAND, seed=87), Strange(gyro=lambda t, reading, _: np.clip(reading, -1.0, 1.0)))
     doubtful = doubtful_pairs(phone.observed, phone.capture, phone.profile)
     assert (~doubtful.hit).sum() < LEAST_PAIRS_LEFT
@@ -319,7 +322,7 @@ def test_a_gyroscope_that_clips_in_most_frames_is_bridged_in_all() -> None:
 
 @pytest.mark.scenario
 def test_a_wrong_offset_beside_a_gap_keeps_its_name_and_size() -> None:
-    """Bridges follow the causes that enter."""
+    """Bridges are refitted for each cause that enters."""
     wall = replace(HAND, seed=88, sway_m=0.03, plane_per_m=(0.05, -0.1, 0.4), accel_bias_m_s2=(0.0, 0.0, 0.0))
     phone = StrangePhone(wall, Strange(gyro=filled(1.1, 1.25)))
     nominal = replace(phone.profile, depth_m=None, time_offset_s=phone.setup.time_offset_s - 0.006)
@@ -330,7 +333,7 @@ def test_a_wrong_offset_beside_a_gap_keeps_its_name_and_size() -> None:
 
 
 def test_an_inaccurate_bridge_is_withheld_from_the_profile() -> None:
-    """It joins both sides of its interval in the fit, but restoration must not use it."""
+    """The fit uses it to join both sides of its interval, but restoration must not use it."""
     stretches = tuple(Stretch("straight", t, t + 0.1, (0, 1, 2)) for t in (0.5, 1.5))
     good, bad = bridging_form(stretches, 0, np.ones(3)).fields
     entry = Distrusted(stretches, (good, bad), (True, False), 1e-9, 3.0, 0.2, 0.1)
@@ -341,8 +344,8 @@ def test_an_inaccurate_bridge_is_withheld_from_the_profile() -> None:
     assert "1 of 2 bridged from the points, the others not corrected by process" in field.sentence
 
 
-def test_the_knots_of_a_bridge_follow_what_a_clipped_peak_lacks() -> None:
-    """The angle of the missing rate comes back to 0.15 mrad in the typical peak."""
+def test_the_knots_of_a_bridge_resolve_a_clipped_peak() -> None:
+    """The angle of the missing rate is reproduced to 0.15 mrad in a typical peak."""
     phone = StrangePhone(replace(HAND, seed=91, frames=240), Strange())
     time_s, whole = phone.imu.time_s, phone.imu.gyro_rad_s
     limit = 1.3
@@ -362,8 +365,8 @@ def test_the_knots_of_a_bridge_follow_what_a_clipped_peak_lacks() -> None:
     assert np.median(worst_rad) < 1.5e-4
 
 
-def test_a_bridge_that_no_row_sees_blurs_nothing() -> None:
-    """The rate between two exposures is uncertain without making a blur path so."""
+def test_a_bridge_outside_all_exposures_adds_no_blur() -> None:
+    """An uncertain rate between two exposures does not make a blur path uncertain."""
     phone = StrangePhone(replace(HAND, seed=89), Strange())
     _, fitted, table = fitted_to(phone)
     end_s = float(phone.stamp_s[20]) + phone.setup.time_offset_s
@@ -374,8 +377,8 @@ def test_a_bridge_that_no_row_sees_blurs_nothing() -> None:
         assert (blur_px > 0) == is_seen
 
 
-def test_what_no_row_sees_of_a_stretch_is_straight_and_in_doubt() -> None:
-    """Of a bridge without points nothing but its ends is known; a hand's turns give the deviation."""
+def test_a_bridge_without_points_is_straight_and_uncertain() -> None:
+    """Only its ends are known; the variation of hand motion gives the standard deviation."""
     phone = StrangePhone(replace(HAND, seed=84), Strange())
     stretch = Stretch("straight", 0.5, 0.7, (0, 2))
     walk = rate_walk(phone.imu)
@@ -396,8 +399,8 @@ def test_two_unknown_effects_at_once_are_two_fields() -> None:
     assert {field.kind for field in fields} == {"delay", "displacement"}
 
 
-def test_calibrate_follows_rows_that_are_read_unevenly() -> None:
-    """Under a profile with the delay over the row, offset and readout come out, and the field stays."""
+def test_calibrate_uses_the_delay_field_of_a_profile() -> None:
+    """With a delay over the row, offset and readout time are estimated correctly, and the field stays."""
     phone = StrangePhone(replace(HAND, seed=85), Strange(late_s=late_s))
     rows = Field("delay", ("row",), ((0.0, 0.25, 0.5, 0.75, 1.0),), ((0.0,), (0.0015,), (0.002,), (0.0015,), (0.0,)))
     given = phone.profile.with_fields([rows])
@@ -410,8 +413,8 @@ def test_calibrate_follows_rows_that_are_read_unevenly() -> None:
 
 
 @pytest.mark.parametrize("seed", [81, 82])
-def test_nothing_hidden_has_no_field_and_no_stretch(seed: int) -> None:
-    """No false alarm."""
+def test_an_ordinary_phone_has_no_field_and_no_doubtful_interval(seed: int) -> None:
+    """No false alarm is raised."""
     phone = StrangePhone(replace(HAND, seed=seed), Strange())
     verdict, fields = judged(phone, phone.profile)
     assert not fields
@@ -420,13 +423,13 @@ def test_nothing_hidden_has_no_field_and_no_stretch(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("size", "left_px", "stated"), [(0.55, 1.2, False), (0.55, 0.25, True), (0.05, 1.2, True)])
-def test_a_field_that_no_phone_has_must_explain_the_points(size: float, left_px: float, stated: bool) -> None:
-    """A zoom by half explains them; where 1.2 px are left of 0.24 px of noise, the model does not follow the frames."""
+def test_an_implausible_field_must_explain_the_points(size: float, left_px: float, stated: bool) -> None:
+    """A zoom by 55 % is accepted only if the residual falls to about the noise of 0.24 px."""
     assert is_believable("scale", [np.array([[0.0], [size]])], left_px, 0.24) is stated
 
 
-def test_named_causes_alone_are_no_field() -> None:
-    """What the ladder explains leaves nothing to describe."""
+def test_causes_of_the_catalogue_alone_give_no_field() -> None:
+    """The ladder's causes leave no residual to describe."""
     phone = StrangePhone(replace(HAND, seed=84, k1=-0.08, focal_drift_per_s=0.02), Strange())
     lens = phone.profile.intrinsics
     assert lens is not None
@@ -440,7 +443,7 @@ def test_named_causes_alone_are_no_field() -> None:
 
 
 def test_a_found_field_holds_in_another_capture_of_the_phone() -> None:
-    """The extended profile predicts the points of a capture that took no part."""
+    """The extended profile predicts the points of a capture that was not used."""
     strange = Strange(late_s=late_s)
     phone = StrangePhone(HAND, strange)
     found, _ = judged(phone, phone.profile)
@@ -456,20 +459,20 @@ def test_a_found_field_holds_in_another_capture_of_the_phone() -> None:
     assert isinstance(found.model.profile.shutter.uneven, Field)
 
 
-def test_a_lens_switch_is_a_step_and_no_drift() -> None:
-    """One and a half per cent from one instant on, for which a drift of the focal length must not stand in."""
+def test_a_lens_switch_is_a_step_and_not_a_drift() -> None:
+    """The focal length changes by 1.5 % at one instant; a focal drift must not replace the step."""
     phone = StrangePhone(replace(HAND, seed=86), Strange(longer=lambda t: np.where(t < 1.21, 0.0, 0.015)))
     verdict, (field,) = judged(phone, phone.profile, rungs=2)
     assert not verdict.accepted
     assert (field.kind, field.covariates, field.shape) == ("scale", ("time",), "a step")
     assert field.size == pytest.approx(0.015, rel=0.1)
-    # between two frames any instant is as good
+    # between two frames the instant is not determined
     assert np.mean(field.fields[0].knots[0]) == pytest.approx(1.21, abs=0.04)
     assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
 
 
 def test_a_slight_lens_switch_is_a_step() -> None:
-    """A fifth of a per cent: between the two frames points go no further than they err."""
+    """At 0.2 %, points move less between the two frames than their tracking error."""
     phone = StrangePhone(replace(HAND, seed=86), Strange(longer=lambda t: np.where(t < 1.21, 0.0, 0.002)))
     verdict, (field,) = judged(phone, phone.profile, rungs=2)
     assert not verdict.accepted
@@ -479,7 +482,7 @@ def test_a_slight_lens_switch_is_a_step() -> None:
 
 @pytest.mark.parametrize("off_s", [-0.09, 0.09])
 def test_the_instant_of_a_lens_switch_is_found_from_some_frames_off(off_s: float) -> None:
-    """As far as a first look, which passes over the frames about a change, may err."""
+    """The search starts up to 0.09 s off, as far as the first estimate may err."""
     phone = StrangePhone(replace(HAND, seed=86), Strange(longer=lambda t: np.where(t < 1.21, 0.0, 0.015)))
     evidence, fitted, table = fitted_to(phone)
     seen = point_residuals(evidence.imu, fitted, table)
@@ -487,16 +490,16 @@ def test_the_instant_of_a_lens_switch_is_found_from_some_frames_off(off_s: float
     assert form.step_s == pytest.approx(1.21, abs=0.04)
 
 
-def test_a_focal_length_that_settles_soon_is_no_step_beside_a_curve() -> None:
-    """It grows most between the first two frames, and is one curve all the same."""
+def test_a_quickly_settling_focal_length_is_one_curve() -> None:
+    """It changes most between the first two frames but is not described as a step and a curve."""
     setup = replace(HAND, seed=87, frames=91, points=40)
     phone = StrangePhone(setup, Strange(longer=lambda t: 0.01 * (1 - np.exp(-np.maximum(t, 0) / 0.4))))
     _, (field,) = judged(phone, phone.profile, rungs=2)
     assert (field.covariates, field.shape) == (("time",), "levelling off")
 
 
-def test_a_focal_length_that_settles_soon_is_not_taken_for_another_focal_length() -> None:
-    """The ladder names the constant part; the field, which says all of it, takes its place."""
+def test_a_quickly_settling_focal_length_is_not_a_wrong_focal_length() -> None:
+    """The ladder names the constant part; the field, which describes all of it, replaces that cause."""
 
     def longer(time_s):
         return 0.02 * (1 - np.exp(-np.maximum(time_s, 0) / 0.4))
@@ -508,8 +511,8 @@ def test_a_focal_length_that_settles_soon_is_not_taken_for_another_focal_length(
     assert gained(field) > 0.8
 
 
-def test_what_gains_in_the_first_blocks_alone_is_no_chance() -> None:
-    """Settled in a seventh of the capture, it gains in so few blocks that all blocks' scatter hides it."""
+def test_an_effect_in_the_first_time_blocks_is_found() -> None:
+    """It settles within a seventh of the capture, and the scatter over all time blocks would hide its gain."""
 
     def longer(time_s):
         return -0.0054 * (1 - np.exp(-np.maximum(time_s, 0) / 0.475))
@@ -521,8 +524,8 @@ def test_what_gains_in_the_first_blocks_alone_is_no_chance() -> None:
     assert (field.covariates, field.shape) == (("time",), "levelling off")
 
 
-def test_a_pause_in_the_readout_is_a_jump_of_the_row() -> None:
-    """Two even blocks with 2 ms between them: six knots do not say it, more are taken."""
+def test_a_pause_in_the_readout_is_a_jump_over_the_row() -> None:
+    """Two even blocks with 2 ms between them need more than six knots."""
 
     def pause(fraction):
         return 0.002 * (np.clip((fraction - 0.55) / 0.03, 0, 1) - fraction)
@@ -534,8 +537,8 @@ def test_a_pause_in_the_readout_is_a_jump_of_the_row() -> None:
     assert gained(field) > 0.8
 
 
-def test_a_clock_that_wanders_is_a_delay_over_time() -> None:
-    """Neither an offset nor a constant skew; the frames' times come back."""
+def test_a_wandering_clock_is_a_delay_over_time() -> None:
+    """Neither an offset nor a constant skew describes it; the frames' times are recovered."""
 
     def late(stamp_s):
         return 0.003 * np.sin(2 * np.pi * 0.6 * stamp_s)
@@ -550,8 +553,8 @@ def test_a_clock_that_wanders_is_a_delay_over_time() -> None:
     assert np.std(off - line) < 5e-4
 
 
-def test_a_focus_that_hunts_is_a_scale_over_a_few_frames() -> None:
-    """To and fro 1.4 times a second: knots 0.4 s apart see nothing of it, finer ones say it."""
+def test_a_hunting_focus_is_a_scale_over_time() -> None:
+    """An oscillation at 1.4 Hz is invisible to knots 0.4 s apart and is described by finer ones."""
     phone = StrangePhone(replace(HAND, seed=90), Strange(longer=lambda t: 0.005 * np.sin(2 * np.pi * 1.4 * t)))
     _, (field,) = judged(phone, phone.profile)
     assert (field.kind, field.covariates) == ("scale", ("time",))
@@ -559,14 +562,14 @@ def test_a_focus_that_hunts_is_a_scale_over_a_few_frames() -> None:
     assert gained(field) > 0.8
 
 
-def test_what_points_of_one_frame_share_below_their_noise_is_no_field() -> None:
-    """Trackers err alike over a blurred frame: a scale of single frames that gains 0.3 of the noise may be theirs."""
+def test_a_scale_below_the_tracking_noise_is_not_a_field() -> None:
+    """Tracking errors of a blurred frame are correlated; a small scale change of single frames may be such an error."""
     phone = StrangePhone(replace(HAND, seed=91), Strange(longer=lambda t: 0.001 * np.sin(2 * np.pi * 1.4 * t)))
     assert not judged(phone, phone.profile)[1]
 
 
-def test_a_focal_length_that_comes_back_at_once_is_no_step() -> None:
-    """A pulse of a fifth of a second lies in too few frames for a test by signs, and is found by their size."""
+def test_a_short_pulse_of_the_focal_length_is_not_a_step() -> None:
+    """A pulse of 0.2 s covers too few frames for a sign test and is found by its size."""
     phone = StrangePhone(
         replace(HAND, seed=91, points=40), Strange(longer=lambda t: 0.012 * np.exp(-(((t - 1.1) / 0.12) ** 2)))
     )
@@ -578,8 +581,8 @@ def test_a_focal_length_that_comes_back_at_once_is_no_step() -> None:
 
 
 @pytest.mark.scenario
-def test_a_gyroscope_that_sticks_near_rest_is_no_scale() -> None:
-    """A dead zone of 0.02 rad/s is found, though the ladder first takes it for a wrong gyroscope scale."""
+def test_a_gyroscope_dead_zone_is_not_a_scale() -> None:
+    """A dead zone of 0.02 rad/s is found although the ladder first names a wrong gyroscope scale."""
     stuck = Strange(gyro=lambda t, reading, _: np.sign(reading) * np.maximum(np.abs(reading) - 0.02, 0))
     phone = StrangePhone(replace(HAND, seed=92, points=40), stuck)
     verdict, (field,) = judged(phone, phone.profile, rungs=2)
@@ -591,8 +594,8 @@ def test_a_gyroscope_that_sticks_near_rest_is_no_scale() -> None:
 
 
 @pytest.mark.scenario
-def test_a_dent_in_a_window_takes_a_finer_map() -> None:
-    """A bump a sixth of the picture wide."""
+def test_a_local_distortion_takes_a_finer_map() -> None:
+    """The distortion covers a sixth of the frame's width."""
 
     def shifted(arm_px, _time):
         off = (arm_px - (130, -60)) / 100
@@ -605,8 +608,8 @@ def test_a_dent_in_a_window_takes_a_finer_map() -> None:
     assert gained(field) > 0.8
 
 
-def test_a_readout_that_changes_is_a_delay_over_row_and_time() -> None:
-    """Neither covariate alone says it, and nothing stays in the model that only stood in."""
+def test_a_changing_readout_is_a_delay_over_row_and_time() -> None:
+    """Neither covariate alone describes it, and no compensating cause stays in the model."""
     phone = StrangePhone(
         replace(HAND, seed=94), Strange(late_in_frame_s=lambda row, stamp_s: 0.0025 * row * (stamp_s > 1))
     )
@@ -619,7 +622,7 @@ def test_a_readout_that_changes_is_a_delay_over_row_and_time() -> None:
 
 
 def test_distortion_that_follows_the_focus_holds_for_the_phone() -> None:
-    """A scale over the radius times the focus; time would say it as well here, and is named."""
+    """It is a scale over radius and focus; time explains this capture equally well and is named as a rival."""
 
     def shifted(arm_px, time_s):
         return 5.0 * ((focus_dioptres(time_s) - 0.5) / 2 * ((arm_px / 320) ** 2).sum(axis=1))[:, None] * arm_px / 320
@@ -634,7 +637,7 @@ def test_distortion_that_follows_the_focus_holds_for_the_phone() -> None:
 
 @pytest.mark.scenario
 def test_a_gyroscope_whose_scale_drifts_is_a_rate_over_rate_and_time() -> None:
-    """A constant scale leaves half of it."""
+    """A constant scale leaves half of the error."""
     drifting = Strange(gyro=lambda t, reading, _: reading * (1 + 0.03 * np.clip(t / 2, 0, 1))[:, None])
     phone = StrangePhone(replace(HAND, seed=96), drifting)
     verdict, (field,) = judged(phone, phone.profile, rungs=1)
@@ -644,12 +647,12 @@ def test_a_gyroscope_whose_scale_drifts_is_a_rate_over_rate_and_time() -> None:
 
 
 class WanderingPhone(StrangePhone):
-    """A phone whose frames come later than their stamps, by a function of the stamp."""
+    """A phone whose frames lag their timestamps by a function of the timestamp."""
 
     def __init__(self, setup: Setup, late: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> None:
         super().__init__(setup, Strange())
         self.late = late
 
     def seen_s(self, points_px, frame):
-        """All rows of a frame are late alike."""
+        """All rows of a frame have the same lag."""
         return super().seen_s(points_px, frame) + self.late(self.stamp_s)[frame]

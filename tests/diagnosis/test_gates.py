@@ -1,4 +1,4 @@
-"""What has to be true before a cause is named: gates, blocks that took no part, errors that hang together."""
+"""Conditions for naming a cause: significance levels, held-out time blocks, and correlated errors."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ def hand() -> tuple[Recording, Evidence]:
     return camera, make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), camera.observed)
 
 
-# ── held out ─────────────────────────────────────────────────────────────────────────────────────────────────────
+# ── held-out data ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_points_are_judged_by_fits_that_did_not_see_them() -> None:
-    """Half of the blocks shifted in time: each half is judged by the other half's offset."""
+def test_points_are_judged_by_fits_to_the_other_blocks() -> None:
+    """Half of the time blocks are shifted in time: each half is judged with the other half's offset."""
     camera, evidence = hand()
     late = (evidence.block % 2).astype(float) * 0.012
     stamps = camera.observed.stamp_s.copy()
@@ -70,8 +70,8 @@ def test_points_are_judged_by_fits_that_did_not_see_them() -> None:
         np.testing.assert_allclose(judged.distance[held], expected[held], rtol=1e-6)
 
 
-def test_what_was_chosen_is_judged_where_nothing_chose_it() -> None:
-    """A cause that only its own block likes is chosen nowhere else, and not there either."""
+def test_a_choice_is_judged_on_blocks_that_did_not_make_it() -> None:
+    """A cause favoured by a single time block is not chosen, not even for that block."""
     _, evidence = hand()
     table = evidence.table(Model(hand()[0].profile, None, ()), 3500)
     block, blocks = evidence.block[table.pair], int(evidence.block.max()) + 1
@@ -89,14 +89,14 @@ def test_what_was_chosen_is_judged_where_nothing_chose_it() -> None:
     both = frozenset({"focal_length", "clock_skew"})
     found = choose(evidence, [base, steady, by_chance], (both, both), 1.0)
     assert found.block_loss[2] == pytest.approx(0.95)
-    # other blocks of its parity see that block, and may choose by it
+    # other blocks of its parity include that block and may choose by it
     assert found.block_loss[1] == pytest.approx(0.95)
     nothing = choose(evidence, [base, steady, by_chance], (frozenset(), frozenset()), 1.0)
     np.testing.assert_allclose(nothing.block_loss, 1.0)
 
 
 def test_brightness_is_judged_on_the_other_blocks(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No fit sees an observation that it is judged by, and every observation judges one."""
+    """No fit uses an observation that it is judged on, and every observation judges one fit."""
     observed = replace(made_observations(hidden(), rng), x_px=np.arange(150.0 * FRAMES))
     seen: list[Any] = []
     held: list[Any] = []
@@ -114,8 +114,8 @@ def test_brightness_is_judged_on_the_other_blocks(rng: np.random.Generator, monk
     assert len(np.unique(np.concatenate(held))) == len(observed)
 
 
-def test_the_noise_of_brightness_is_that_measured_beforehand(rng: np.random.Generator) -> None:
-    """What a fit leaves is no measure of the noise, whether it is less or more."""
+def test_the_noise_of_brightness_is_the_measured_one(rng: np.random.Generator) -> None:
+    """The residual of a fit does not define the noise, whether it is smaller or larger."""
     observed = made_observations(hidden(vignetting_corner_loss=0.3), rng)
     noisier = replace(observed, noise=1.5 * observed.noise)
     held = judge(noisier, NOMINAL, [VIGNETTING])
@@ -124,7 +124,7 @@ def test_the_noise_of_brightness_is_that_measured_beforehand(rng: np.random.Gene
 
 
 def test_blur_is_judged_on_blocks_that_it_was_not_fitted_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The masks of fit and judge share no residual; each effect is judged on the others that determine it."""
+    """Fit and judgement share no residual; each effect is judged on the kind of residual that determines the other."""
     time_s = np.linspace(0.0, 4.0, 80)
     fits: list[Any] = []
     judged: list[Any] = []
@@ -143,11 +143,11 @@ def test_blur_is_judged_on_blocks_that_it_was_not_fitted_to(monkeypatch: pytest.
         assert np.array_equal(of_defocus, ~fits[2 * fold] & seen.is_edge)
 
 
-# ── gates of the points ──────────────────────────────────────────────────────────────────────────────────────────
+# ── conditions for points ────────────────────────────────────────────────────────────────────────────────────────
 
 
 def trial_of(monkeypatch: pytest.MonkeyPatch, losses: dict[str, Any], p_value: float = 0.0) -> Any:
-    """What the ladder makes of causes with these held-out losses by block; the model without has 1 everywhere."""
+    """The ladder's decision for causes with these held-out losses by block; the model without them has 1 everywhere."""
     camera, evidence = hand()
     model = Model(camera.profile, None, ())
 
@@ -166,14 +166,14 @@ def trial_of(monkeypatch: pytest.MonkeyPatch, losses: dict[str, Any], p_value: f
 WOBBLE = np.array([0.01, -0.01, 0.02, -0.02, 0.01, -0.01, 0.0, 0.0])
 
 
-def test_a_gain_must_be_worth_naming(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two thousandths of the loss, however even, are not; two hundredths are."""
+def test_a_gain_must_exceed_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gain of 0.2 % of the loss does not count, however even it is; a gain of 2 % does."""
     assert trial_of(monkeypatch, {"focal_length": 0.998 + 1e-3 * WOBBLE})[0] is None
     assert trial_of(monkeypatch, {"focal_length": 0.98 + 1e-2 * WOBBLE})[0] is not None
 
 
-def test_a_gain_must_hold_between_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One block's gain is none; a large gain need be less even than a small one."""
+def test_a_gain_must_be_consistent_over_time_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gain of a single block does not count; a large gain may be less even than a small one."""
     single = np.ones(8)
     single[3] = 0.5
     assert trial_of(monkeypatch, {"focal_length": single})[0] is None
@@ -185,8 +185,8 @@ def test_a_gain_must_hold_between_blocks(monkeypatch: pytest.MonkeyPatch) -> Non
     assert trial_of(monkeypatch, {"focal_length": 1 - 4 * gain})[0] is not None
 
 
-def test_causes_that_the_blocks_do_not_tell_apart_are_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cause nearly as good in every block is none; one that is as good in the mean and better in some is."""
+def test_causes_that_time_blocks_cannot_separate_are_rivals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cause slightly worse in every block is no rival; one equal on average and better in some blocks is."""
     best = 0.80 + WOBBLE
     step, other = trial_of(monkeypatch, {"focal_length": best, "gyro_scale": best + 0.02 + 0.3 * WOBBLE})
     assert step is not None
@@ -198,8 +198,8 @@ def test_causes_that_the_blocks_do_not_tell_apart_are_rivals(monkeypatch: pytest
     assert other.accepted[0].name == "gyro_scale"
 
 
-def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One in a thousand is too likely for one of twenty-two causes; for a word its gain by blocks decides."""
+def test_a_parameter_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A p-value of 1e-3 is too large for one of many causes; for a word the gain by time blocks decides."""
     assert MAX_P * len(EFFECTS) == pytest.approx(FALSE_ALARM)
     camera, evidence = hand()
     model = Model(camera.profile, None, ())
@@ -214,7 +214,7 @@ def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
     assert significant(evidence, word, camera.profile, uneven)[0] is None
 
 
-# ── gates of brightness ──────────────────────────────────────────────────────────────────────────────────────────
+# ── conditions for brightness ────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize(
@@ -227,10 +227,10 @@ def test_a_value_must_be_significant(monkeypatch: pytest.MonkeyPatch) -> None:
         (HeldOutGain(PHOTOMETRY, 1.0, 0.9, 1.1), 1e-9, True),
     ],
 )
-def test_brightness_gains_too(
+def test_a_brightness_cause_must_gain_and_be_significant(
     held: HeldOutGain, p_value: float, named: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cause takes 15 % of the excess away and 2 % of the whole, and is significant; its rung has held-out values."""
+    """It removes enough of the excess and of the whole residual and is significant; its rung has held-out values."""
     observed = made_observations(hidden(), rng)
     plain, better = (
         SimpleNamespace(cost=10.0, memory=0.0, rms=3.0, profile=NOMINAL),
@@ -246,10 +246,10 @@ def test_brightness_gains_too(
 
 
 @pytest.mark.parametrize(("after", "named"), [(1.2, True), (1.6, False)])
-def test_a_gain_of_each_frame_takes_half_of_the_excess_on_other_sides(
+def test_gains_per_frame_must_remove_half_of_the_excess(
     after: float, named: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A vignette needs less, at other times and on other sides; either is judged beside what is in."""
+    """A vignette needs to remove less. Both are judged together with the effects already included."""
     observed = made_observations(hidden(), rng)
     held, beside = HeldOutGain(PHOTOMETRY, 2.0, after, 0.9), []
 
@@ -265,11 +265,11 @@ def test_a_gain_of_each_frame_takes_half_of_the_excess_on_other_sides(
     assert len(beside) == 3
 
 
-# ── errors that hang together ────────────────────────────────────────────────────────────────────────────────────
+# ── correlated errors ────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_points_of_one_moment_share_its_errors(rng: np.random.Generator) -> None:
-    """A shift common to each pair's points makes an offset less certain than as large a shift of each point."""
+def test_points_of_one_pair_have_correlated_errors(rng: np.random.Generator) -> None:
+    """A shift common to each pair's points makes an offset less certain than independent shifts of the same size."""
     camera, evidence = hand()
     model = Model(camera.profile, None, (terms_of.TIME_OFFSET,))
     table = evidence.table(model, 3500)
@@ -282,8 +282,8 @@ def test_points_of_one_moment_share_its_errors(rng: np.random.Generator) -> None
     assert stds[0] > 1.6 * stds[1]
 
 
-def test_patches_of_one_moment_share_its_errors(rng: np.random.Generator) -> None:
-    """Light that leans towards the corners in some stretches of time makes vignetting less certain."""
+def test_patches_of_one_time_block_have_correlated_errors(rng: np.random.Generator) -> None:
+    """Light that varies towards the corners from block to block makes vignetting less certain."""
     observed = made_observations(hidden(), rng)
     lean = rng.normal(size=int(time_blocks(observed).max()) + 1)[time_blocks(observed)]
     wandering = replace(observed, grey=observed.grey + 2.0 * NOISE * lean * (observed.radius**2 - 0.2))
@@ -294,8 +294,10 @@ def test_patches_of_one_moment_share_its_errors(rng: np.random.Generator) -> Non
     assert stds[0] > 1.25 * stds[1]
 
 
-def test_blur_of_one_moment_shares_its_errors(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Residuals that are alike in a stretch of time tell less than as many that are not."""
+def test_blur_of_one_time_block_has_correlated_errors(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Residuals that are equal within a time block are weaker evidence than independent ones."""
     time_s = np.linspace(0.0, 4.0, 400)
     edges = SimpleNamespace(width_px=np.zeros(0), reach_px=np.zeros(0))
     seen = SimpleNamespace(time_s=time_s, damping_std=0.1, is_edge=np.zeros(400, bool), edges=edges)
@@ -305,7 +307,7 @@ def test_blur_of_one_moment_shares_its_errors(rng: np.random.Generator, monkeypa
     common = rng.normal(size=8)[local_blur.time_blocks(time_s)]
     variances = []
     for left in (common, rng.permutation(common)):
-        # no damping changes them
+        # residuals do not change with damping
         monkeypatch.setattr(local_blur_fit._Widths, "left", lambda *_, r=left: r)
         look, none = Residuals(left, slope, left), np.zeros(3)
         found = System(none, look, slope[:, None], left[:, None], np.zeros(400), 1.0, np.array([0.0, 1.0, 1.0]), none)
@@ -313,8 +315,8 @@ def test_blur_of_one_moment_shares_its_errors(rng: np.random.Generator, monkeypa
     assert variances[0] > 8 * variances[1]
 
 
-def test_levels_are_asked_alike_of_all_evidence() -> None:
-    """Significance, size, held-out gain and evenness each keep a cause from being named."""
+def test_the_same_levels_apply_to_all_evidence() -> None:
+    """Significance, size, held-out gain and evenness can each keep a cause from being named."""
     levels = Levels(1e-3, 0.1, 0.05, ((0.1, 0.01), (0.3, 0.05)), {"defocus": 0.5})
     assert levels.significant(9e-4)
     assert not levels.significant(1e-3)
@@ -329,8 +331,8 @@ def test_levels_are_asked_alike_of_all_evidence() -> None:
 
 
 @pytest.mark.parametrize(("name", "change"), [("exposure_time", 0.19), ("defocus", 1.0)])
-def test_blur_names_a_cause_by_the_probability_that_it_tells(name: str, change: float) -> None:
-    """Deviations come from the scatter of a few blocks: four of them are too few, by Student's distribution."""
+def test_blur_names_a_cause_by_its_p_value(name: str, change: float) -> None:
+    """Deviations are estimated from few blocks: by Student's distribution, 4.2 deviations are too few."""
     value = ParameterChange(0.0, change, 0.0)
     named = {z: picture_ladder._BlurChange(value, change, z).is_named(name) for z in (4.2, 12.0)}
     assert named == {4.2: False, 12.0: True}

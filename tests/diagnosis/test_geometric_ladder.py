@@ -1,4 +1,4 @@
-"""The geometric ladder on tracks made without pictures: it names what was hidden, with its size, and nothing else."""
+"""The geometric ladder on synthetic tracks: it names the hidden causes with their sizes and no others."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ NEAR = replace(WALL, seed=63, frames=31, points=12)
 
 @lru_cache(maxsize=2)
 def recorded(setup: Setup) -> Recording:
-    """Make each recording once."""
+    """Make each recording only once."""
     return Recording(setup)
 
 
 def evidence(setup: Setup) -> Evidence:
-    """What the ladder is given of a recording; inertial samples cut short, for they take most of the time."""
+    """The ladder's input for a recording, with shortened inertial samples to save time."""
     camera = recorded(setup)
     return make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), camera.observed)
 
@@ -57,7 +57,7 @@ def climbed(setup: Setup, nominal: CameraProfile) -> tuple[GeometricVerdict, lis
 
 
 def assert_explained(verdict: GeometricVerdict, noise_px: float) -> None:
-    """Whatever the nominal profile left, nothing but noise is left at the end, and the last rung is empty."""
+    """Only noise is left at the end, whatever the nominal profile left, and the last rung is empty."""
     assert verdict.nominal_rms_px > 1.5 * noise_px
     assert verdict.final_rms_px == pytest.approx(noise_px, rel=0.1)
     assert verdict.rungs[-1].entered is None
@@ -65,14 +65,14 @@ def assert_explained(verdict: GeometricVerdict, noise_px: float) -> None:
 
 
 def assert_holds(change: ParameterChange, nominal: object, truth: object) -> None:
-    """The nominal value is told as given, and the truth lies within four deviations of the estimate."""
+    """The nominal value is as given, and the truth lies within four deviations of the estimate."""
     np.testing.assert_allclose(change.nominal, nominal)
     assert (np.abs(np.subtract(change.estimate, truth)) < 4 * np.array(change.std)).all()
     assert (np.array(change.std) < 0.3 * np.abs(np.subtract(nominal, truth)).max()).all()
 
 
-def test_a_true_profile_is_left_alone() -> None:
-    """Where nothing is hidden nothing is named, and both residuals are the noise."""
+def test_a_true_profile_has_no_cause() -> None:
+    """With nothing hidden, no cause is named and both residuals equal the noise."""
     verdict, found = climbed(HAND, recorded(HAND).profile)
     assert found == []
     assert [rung.entered for rung in verdict.rungs] == [None]
@@ -81,7 +81,10 @@ def test_a_true_profile_is_left_alone() -> None:
 
 
 def test_an_offset_and_a_bias_are_named_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """9 ms and 0.02 rad/s hidden at once, among the causes most like them: two rungs, two findings, both right."""
+    """9 ms and 0.02 rad/s are hidden together, with similar causes as candidates.
+
+    Two rungs and two findings, both right.
+    """
     alike = ("time_offset", "timestamp_reference", "readout_time", "gyro_bias", "imu_rotation", "focal_length")
     monkeypatch.setattr(candidates, "GEOMETRIC_EFFECTS", tuple(EFFECT[name] for name in alike))
     truth = recorded(HAND).profile
@@ -99,8 +102,8 @@ def test_an_offset_and_a_bias_are_named_together(monkeypatch: pytest.MonkeyPatch
         assert finding.sentence
 
 
-def test_a_readout_of_the_wrong_sense_is_named() -> None:
-    """Read downwards, told as upwards: the word is found, and no other cause with it."""
+def test_a_wrong_readout_direction_is_named() -> None:
+    """The profile has the opposite direction: the right one is found without another cause."""
     truth = recorded(HAND).profile
     nominal = replace(truth, shutter=replace(truth.shutter, readout_direction="bottom_to_top"))
     verdict, found = climbed(HAND, nominal)
@@ -113,7 +116,10 @@ def test_a_readout_of_the_wrong_sense_is_named() -> None:
 
 @pytest.mark.parametrize(("seed", "scale"), [(81, 1.12), (82, 0.9)])
 def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: float) -> None:
-    """A gyroscope that tells too much, and a focal length given too short for it: right but for roll, alone worse."""
+    """A wrong gyroscope scale and a focal length that compensates for it are wrong only for roll.
+
+    Correcting one alone is worse.
+    """
     setup = replace(HAND, seed=seed, frames=61, about=(0.8, 1.0, 1.0), gyro_scale=scale)
     truth = recorded(setup).profile
     lens = truth.intrinsics
@@ -129,21 +135,21 @@ def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: fl
     assert_holds(named["focal_length"].parameters["focal_scale"], 1.0, scale)
     for finding in found:
         assert finding.held_out.after < 0.8 * finding.held_out.before
-        # what a smooth flow leaves, not what the fit does
+        # the noise is the residual of a smooth flow, not that of the fit
         assert finding.held_out.noise == verdict.noise_px != verdict.final_rms_px
 
 
 @pytest.fixture
 def like_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Among the causes most like a low pass and pixels that are not square; with all others too in the stories."""
+    """Candidates limited to causes similar to a low-pass filter and non-square pixels; the scenario tests use all."""
     alike = ("time_offset", "readout_time", "gyro_scale", "focal_length", "stabilisation")
     own = (EFFECT[name] for name in (*alike, "gyro_lowpass", "pixel_aspect"))
     monkeypatch.setattr(candidates, "GEOMETRIC_EFFECTS", tuple(own))
 
 
 @pytest.mark.parametrize("cutoff_hz", [9.0, 18.0])
-def test_a_gyroscope_behind_a_low_pass_is_named(cutoff_hz: float, like_them: None) -> None:
-    """Late, and too small where it turns fast: no offset of the clocks, which is tried beside it."""
+def test_a_gyroscope_low_pass_is_named(cutoff_hz: float, like_them: None) -> None:
+    """The filter delays rates and attenuates fast rotation; a clock offset is tried and not chosen."""
     setup = replace(HAND, seed=85, frames=61, gyro_lowpass_hz=cutoff_hz)
     truth = recorded(setup).profile
     verdict, found = climbed(setup, replace(truth, extensions=replace(truth.extensions, gyro_lowpass_hz=0.0)))
@@ -156,8 +162,11 @@ def test_a_gyroscope_behind_a_low_pass_is_named(cutoff_hz: float, like_them: Non
 
 
 @pytest.mark.parametrize("hidden", ["time_offset", "gyro_lowpass"])
-def test_a_low_pass_far_above_the_hands_shake_is_an_offset_or_its_rival(hidden: str, like_them: None) -> None:
-    """At 4 Hz and less a cutoff of 90 Hz is a delay of 2.5 ms to 1e-4 of itself: the plainer cause is said."""
+def test_a_low_pass_above_hand_motion_is_reported_as_an_offset(hidden: str, like_them: None) -> None:
+    """Below 4 Hz, a cutoff of 90 Hz equals a delay of 2.5 ms to 1e-4.
+
+    The simpler cause is named, with the filter as a rival.
+    """
     cutoff_hz, late_s = 90.0, np.sqrt(2) / (2 * np.pi * 90.0)
     setup = replace(HAND, seed=86, gyro_lowpass_hz=cutoff_hz if hidden == "gyro_lowpass" else 0.0)
     truth = recorded(setup).profile
@@ -170,8 +179,8 @@ def test_a_low_pass_far_above_the_hands_shake_is_an_offset_or_its_rival(hidden: 
     assert abs(told.estimate - offset_s - late_s) < 4 * told.std
 
 
-def test_a_late_clock_is_no_low_pass(like_them: None) -> None:
-    """12 ms late, as behind a cutoff of 19 Hz: fast turns are as large as slow ones."""
+def test_a_clock_offset_is_not_a_low_pass(like_them: None) -> None:
+    """An offset of 12 ms, as from a cutoff of 19 Hz, does not attenuate fast rotation."""
     truth = recorded(HAND).profile
     _, found = climbed(HAND, replace(truth, time_offset_s=HAND.time_offset_s - 0.012))
     assert [finding.name for finding in found] == ["time_offset"]
@@ -179,8 +188,8 @@ def test_a_late_clock_is_no_low_pass(like_them: None) -> None:
 
 
 @pytest.mark.parametrize("aspect", [1.05, 0.985])
-def test_pixels_that_are_not_square_are_named(aspect: float, like_them: None) -> None:
-    """fy alone is off; neither the focal length nor the gyroscope's scale takes its place."""
+def test_non_square_pixels_are_named(aspect: float, like_them: None) -> None:
+    """Only fy is wrong; neither the focal length nor the gyroscope scale replaces it."""
     setup = replace(HAND, seed=87, pixel_aspect=aspect)
     truth = recorded(setup).profile
     assert truth.intrinsics is not None
@@ -192,8 +201,8 @@ def test_pixels_that_are_not_square_are_named(aspect: float, like_them: None) ->
     assert_holds(found[0].parameters["pixel_aspect"], 1.0, aspect)
 
 
-def test_under_turns_about_one_axis_pixels_that_are_not_square_are_not_passed_over(like_them: None) -> None:
-    """Pictures that move up and down show fy, and fx by little: named, or said as the focal length's rival."""
+def test_non_square_pixels_are_found_with_rotation_about_one_axis(like_them: None) -> None:
+    """Vertical motion determines fy but hardly fx: the aspect is named, or listed as the focal length's rival."""
     setup = replace(HAND, seed=88, about=(0.0, 0.0, 1.0), pixel_aspect=1.04)
     truth = recorded(setup).profile
     assert truth.intrinsics is not None
@@ -212,8 +221,8 @@ def wall_m(recording: Recording) -> float:
     return float(np.median((1 - moved @ plane) / (sight @ plane)))
 
 
-def test_a_depth_is_found_before_a_wall() -> None:
-    """The distance along the optical axis, the median over the frames, within four deviations of the truth."""
+def test_the_depth_of_a_wall_is_found() -> None:
+    """The median distance along the optical axis lies within four deviations of the truth."""
     recording, given = recorded(WALL), evidence(WALL)
     profile = replace(recording.profile, depth_m=None)
     model = Model(profile, None, ())
@@ -225,8 +234,8 @@ def test_a_depth_is_found_before_a_wall() -> None:
     assert std < 0.15 * wall_m(recording)
 
 
-def test_a_wall_that_is_nearer_than_the_profile_says_is_named() -> None:
-    """A wrong plane is no relief about a right one: the depth is named, alone, and found to three hundredths."""
+def test_a_wrong_scene_depth_is_named() -> None:
+    """Only the depth is named, with an error below 3 %; a wrong plane is not described as relief."""
     recording = recorded(NEAR)
     verdict, found = climbed(NEAR, replace(recording.profile, depth_m=2.9))
     assert [finding.name for finding in found] == ["scene_depth"]
@@ -236,8 +245,8 @@ def test_a_wall_that_is_nearer_than_the_profile_says_is_named() -> None:
     assert_explained(verdict, NEAR.noise_px)
 
 
-def test_exposures_that_vary_tell_their_scale() -> None:
-    """Rows' middles move by half of what each exposure is longer: no offset does that."""
+def test_varying_exposures_determine_the_exposure_scale() -> None:
+    """The middle of each row's exposure moves by half of the exposure error, unlike with an offset."""
     truth = recorded(HAND).profile
     nominal = replace(truth, shutter=replace(truth.shutter, exposure_scale=truth.shutter.exposure_scale / 1.4))
     verdict, found = climbed(HAND, nominal)
@@ -246,11 +255,14 @@ def test_exposures_that_vary_tell_their_scale() -> None:
     assert_explained(verdict, HAND.noise_px)
 
 
-# ── the ladder's parts ───────────────────────────────────────────────────────────────────────────────────────────
+# ── parts of the ladder ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_the_scene_is_what_the_profile_allows() -> None:
-    """Infinitely far: none. A depth, or none given: a wall. Without an accelerometer: a direction a pair."""
+def test_the_scene_model_follows_the_profile() -> None:
+    """An infinite depth has no scene; a finite or unknown depth has a plane.
+
+    Without accelerometer each pair has a direction.
+    """
     given, profile = evidence(WALL), recorded(WALL).profile
     table = given.table(Model(profile, None, ()), 500)
     assert base_scene(given, replace(profile, depth_m=np.inf), table) is None
@@ -264,8 +276,11 @@ def test_the_scene_is_what_the_profile_allows() -> None:
     assert len(free.direction) == table.n_pairs
 
 
-def test_blocks_have_lengths_that_differ() -> None:
-    """Every pair has a block; blocks rise one by one, as the list says but shorter for few pairs, the last one cut."""
+def test_time_blocks_have_different_lengths() -> None:
+    """Every pair has a block in rising order.
+
+    Lengths follow the list, shortened for few pairs, and the last block may be cut.
+    """
     block = evidence(HAND).block
     assert len(block) == len(recorded(HAND).pairs)
     assert set(np.diff(block)) <= {0, 1}
@@ -275,8 +290,8 @@ def test_blocks_have_lengths_that_differ() -> None:
     assert len(set(counts[:4])) >= 3
 
 
-def test_a_lag_shows_later_captures_in_early_slots() -> None:
-    """The table's stamps are those of the pictures that the slots really show."""
+def test_a_lag_shifts_the_timestamps_of_early_frames() -> None:
+    """The table's timestamps are those of the content that the early frames show."""
     given = evidence(HAND)
     lag = (0.06, 0.06, 0.03, *[0.0] * 34)
     plain, late = (given.table(Model(recorded(HAND).profile, None, (), lag=way), 10**6) for way in ((), lag))
@@ -285,7 +300,7 @@ def test_a_lag_shows_later_captures_in_early_slots() -> None:
 
 
 def test_a_fit_of_some_pairs_is_judged_on_all() -> None:
-    """Fitted on the even blocks, a wrong offset is put right on the odd ones too, and its distances are unit noise."""
+    """Fitted on the even time blocks, a wrong offset is also corrected on the odd ones, with unit distances."""
     given, profile = evidence(HAND), terms_of.shift_offset(recorded(HAND).profile, np.array([0.006]))
     model = Model(profile, None, ())
     table = given.table(model, 10**6)
@@ -297,8 +312,8 @@ def test_a_fit_of_some_pairs_is_judged_on_all() -> None:
     assert capped_rms(given.distances(given.fit(model, (), table), table, 0.0)[odd]) > 2
 
 
-def test_lost_tracks_do_not_decide() -> None:
-    """Two tracks in a hundred a thousand deviations off raise the capped rms by a tenth and the loss by a fifth."""
+def test_lost_tracks_have_little_influence() -> None:
+    """2 % of tracks off by 1000 deviations raise the capped RMS by less than 15 % and the loss by less than 0.25."""
     distance = np.random.default_rng(3).rayleigh(1.0, 4000)
     astray = np.where(np.arange(4000) % 50 == 0, 1000.0, distance)
     assert capped_rms(distance) == pytest.approx(1.0, rel=0.03)
@@ -308,20 +323,20 @@ def test_lost_tracks_do_not_decide() -> None:
 
 
 @pytest.mark.parametrize("effect", [e for e in GEOMETRIC_EFFECTS if e.term is not None], ids=lambda e: e.name)
-def test_the_total_change_is_what_a_term_changed(effect: object) -> None:
-    """Read back from two profiles, whatever the term: the values that were put in."""
+def test_the_total_change_equals_the_change_of_a_term(effect: object) -> None:
+    """The values put into a profile are read back from the two profiles, for every term."""
     entry = EFFECT[effect.name]  # type: ignore[attr-defined]
     assert entry.term is not None
     profile = recorded(HAND).profile
     step = np.array([0.004, -0.007, 0.011, -0.002])[: len(entry.term)]
     found = entry.total_change(profile, entry.term.change(profile, step))
-    # a stabiliser's cutoff has no nought to count from, and its lean is no part of the cause
+    # a stabiliser's cutoff has no zero, and its lean does not belong to the cause
     known = slice(0, 1) if entry.name == "stabilisation" else slice(None)
     np.testing.assert_allclose(found[known], step[known], atol=1e-9)
 
 
 def test_rotations_between_profiles_are_vectors() -> None:
-    """Up to a quarter turn, on the left of the nominal mounting."""
+    """Rotation vectors apply on the left of the nominal mounting and may be large."""
     profile = recorded(HAND).profile
     vector = np.array([0.3, -0.8, 0.5])
     np.testing.assert_allclose(rotation_between(profile, terms_of.rotate_imu(profile, vector)), vector, atol=1e-9)

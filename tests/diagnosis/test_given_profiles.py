@@ -1,4 +1,4 @@
-"""Causes are changes from the given profile: one that already has the right values is left alone."""
+"""Causes are changes from the given profile: a profile with the right values has none."""
 
 from __future__ import annotations
 
@@ -39,8 +39,10 @@ LIGHT = {
 
 
 @pytest.mark.parametrize("name", LIGHT)
-def test_an_effect_on_light_is_significant_as_a_change_of_the_profile(name: str, rng: np.random.Generator) -> None:
-    """Under the profile without it, not under the one that has it."""
+def test_a_brightness_effect_is_significant_only_as_a_change_of_the_profile(
+    name: str, rng: np.random.Generator
+) -> None:
+    """It is significant for the profile without it and not for the profile with it."""
     effect, true = LIGHT[name]
     observed = made_observations(true, rng, 0.5)
     for given in (NOMINAL, true):
@@ -56,10 +58,10 @@ def test_an_effect_on_light_is_significant_as_a_change_of_the_profile(name: str,
         ("flicker", {"flicker_amplitude": 0.3, "flicker_frequency_hz": 96.0}, "frequency_hz"),
     ],
 )
-def test_the_ladder_counts_a_cause_from_the_profile(
+def test_a_cause_is_measured_from_the_given_profile(
     name: str, wrong: dict[str, float], parameter: str, rng: np.random.Generator
 ) -> None:
-    """The true profile has no cause; a wrong value is the nominal one of its cause."""
+    """The true profile has no cause; a wrong value becomes the nominal value of its cause."""
     _, true = LIGHT[name]
     observed = made_observations(true, rng, 0.5)
     observed = observed.subset(observed.place % 5 == 0)
@@ -72,13 +74,13 @@ def test_the_ladder_counts_a_cause_from_the_profile(
 
 
 def climbed(given: CameraProfile, observed: PhotometricObservations) -> list[Finding]:
-    """The causes of brightness that a profile lacks."""
+    """The brightness causes that a profile lacks."""
     verdict = PictureVerdict(given)
     climb_observations(verdict, observed, FRAMES)
     return verdict.findings
 
 
-def test_gains_are_counted_from_those_of_the_profile(rng: np.random.Generator) -> None:
+def test_gains_are_measured_from_those_of_the_profile(rng: np.random.Generator) -> None:
     """Frames beyond the profile's list have a gain of 1."""
     effect, true = LIGHT["gain_drift"]
     fit = fit_photometry(made_observations(true, rng), true, [effect])
@@ -92,7 +94,7 @@ def test_gains_are_counted_from_those_of_the_profile(rng: np.random.Generator) -
 
 
 def blur_findings(monkeypatch: pytest.MonkeyPatch, given: CameraProfile, scale: float, sigma: float) -> list[Finding]:
-    """What is named where the blur shows this exposure scale and defocus."""
+    """Findings for a blur with this exposure scale and defocus."""
     widths = (np.array([scale]), np.array([sigma]))
     nuisance = np.array([0.6, 0.0])
     found = BlurFit(("", ""), widths, np.diag([0.02**2, 0.05**2]), nuisance, given, 0.1, (True, True))
@@ -116,14 +118,14 @@ def blurred(scale: float, sigma: float) -> CameraProfile:
 
 
 @pytest.mark.parametrize("given", [(1.0, 0.0), (0.8, 2.0), (1.5, 1.3)])
-def test_blur_that_the_profile_has_is_no_cause(monkeypatch, given: tuple[float, float]) -> None:
-    """Whatever its exposure scale and defocus."""
+def test_a_blur_already_in_the_profile_is_not_a_cause(monkeypatch, given: tuple[float, float]) -> None:
+    """The profile already contains the measured exposure scale and defocus, so nothing is found."""
     assert not blur_findings(monkeypatch, blurred(*given), given[0] + 0.01, given[1] + 0.02)
 
 
 @pytest.mark.parametrize(("scale", "sigma"), [(1.0, 0.02), (1.0, 0.0), (0.5, 3.2)])
 def test_blur_is_named_as_a_change_of_the_profile(monkeypatch, scale: float, sigma: float) -> None:
-    """More or less of both, in one fit of all held-out blocks."""
+    """Exposure scale and defocus may both be larger or smaller."""
     found = {f.name: f for f in blur_findings(monkeypatch, blurred(0.8, 2.0), scale, sigma)}
     assert found.keys() == {"exposure_time", "defocus"}
     assert found["exposure_time"].parameters["exposure_scale"] == ParameterChange(0.8, scale, 0.02)
@@ -135,13 +137,13 @@ def test_blur_is_named_as_a_change_of_the_profile(monkeypatch, scale: float, sig
 
 
 def cause(name: str, parameter: str, change: ParameterChange) -> Finding:
-    """A cause found in the points."""
+    """A cause found with the points."""
     return Finding(name, {parameter: change}, HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1), (), 1e-9, "")
 
 
 @pytest.mark.parametrize(("stamp", "share"), [("exposure_start", 0.5), ("exposure_end", -0.5)])
-def test_an_offset_as_an_exposure_is_counted_from_the_profile(stamp: str, share: float) -> None:
-    """10 ms logged, 8 ms by the profile, 12 ms in truth: the middle of each row's exposure is 2 ms later or earlier."""
+def test_an_offset_is_explained_as_an_exposure_change(stamp: str, share: float) -> None:
+    """10 ms logged, 8 ms by the profile, 12 ms in truth: the middle of each row's exposure shifts by 2 ms."""
     given = CameraProfile(64, 48, shutter=Shutter(timestamp=stamp, exposure_scale=0.8))
     offset = cause("time_offset", "time_offset_s", ParameterChange(0.001, 0.001 + share * 0.004, 5e-5))
     change = exposure_hypothesis([offset], np.full(9, 0.01), given)
@@ -151,15 +153,15 @@ def test_an_offset_as_an_exposure_is_counted_from_the_profile(stamp: str, share:
     assert finding.parameters == {"exposure_scale": change}
 
 
-def test_no_exposure_shifts_rows_stamped_at_its_middle() -> None:
-    """Then an offset is an offset."""
+def test_timestamps_at_exposure_middle_are_independent_of_exposure() -> None:
+    """An offset then cannot be explained by the exposure."""
     given = CameraProfile(64, 48, shutter=Shutter(timestamp="exposure_middle"))
     offset = cause("time_offset", "time_offset_s", ParameterChange(0.0, 0.002, 5e-5))
     assert exposure_hypothesis([offset], np.full(9, 0.01), given) is None
 
 
-def test_a_depth_found_is_written_into_the_profile() -> None:
-    """The profile of the fits keeps the given depth: the scene is held beside it."""
+def test_an_estimated_depth_is_written_into_the_profile() -> None:
+    """The profile used for the fits keeps the given depth; the scene is stored separately."""
     given = CameraProfile(64, 48, depth_m=np.inf)
     depth = cause("scene_depth", "depth_m", ParameterChange(np.inf, 1.5, 0.01))
     assert with_depth_of([depth], given).depth_m == 1.5

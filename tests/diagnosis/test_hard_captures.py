@@ -1,4 +1,4 @@
-"""Captures that a diagnosis can say little of end in a verdict with its reason."""
+"""Captures with little information give a verdict with a reason."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", g
 
 @pytest.fixture(scope="module")
 def at_rest(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A camera on a stand."""
+    """A camera on a tripod."""
     folder = tmp_path_factory.mktemp("rest") / "rest"
     simulate_command(folder, width=240, height=320, frames=20, seed=5, rate_rad_s=0.0)
     return folder
 
 
-def test_a_camera_at_rest_tells_nothing_with_exposures_or_without(at_rest: Path) -> None:
-    """Nothing is fitted to points that do not move, and unknown exposures are named as the reason."""
+def test_a_camera_at_rest_is_consistent_without_exposures(at_rest: Path) -> None:
+    """Nothing is fitted to points that do not move, and the notes name unknown exposures as a reason."""
     log = at_rest / "movie_metadata.csv"
     exposure = next(k for k, name in enumerate(_header(log)) if "xposure" in name)
     partial(_fill, log.name, exposure, "null")(at_rest)
@@ -57,8 +57,8 @@ def test_a_camera_at_rest_tells_nothing_with_exposures_or_without(at_rest: Path)
 
 
 @pytest.mark.parametrize("turned_deg", [(90, 0, 0), (0, 0, 180), (0, -90, 90)])
-def test_a_sensor_that_sits_another_way_round_is_named_alone(turned_deg: tuple[float, float, float]) -> None:
-    """The profile of another phone: no fit turns by a right angle, but turns of pictures and log tell the axes."""
+def test_a_sensor_mounted_at_a_right_angle_is_the_only_cause(turned_deg: tuple[float, float, float]) -> None:
+    """A fit cannot rotate by 90°; comparing rotations of frames and log gives the axes."""
     camera = Recording(replace(HAND, frames=49))
     turned = Rotation.from_euler("ZYX", turned_deg, degrees=True).as_matrix() @ camera.profile.rotation_cam_imu
     other = replace(camera.profile, r_cam_imu=tuple(map(tuple, turned.tolist())))
@@ -70,8 +70,8 @@ def test_a_sensor_that_sits_another_way_round_is_named_alone(turned_deg: tuple[f
 
 
 @pytest.mark.parametrize("factor", [0.55, 2.5])
-def test_the_focal_length_of_another_lens_is_named_alone(factor: float) -> None:
-    """An ultra-wide lens or a telephoto, told to be the main one."""
+def test_the_focal_length_of_another_lens_is_the_only_cause(factor: float) -> None:
+    """The capture is from an ultra-wide or telephoto lens and the profile from the main one."""
     camera = Recording(replace(HAND, frames=49))
     lens = camera.profile.intrinsics
     assert lens is not None
@@ -82,8 +82,8 @@ def test_the_focal_length_of_another_lens_is_named_alone(factor: float) -> None:
     assert verdict.model.profile.intrinsics.fx_px == pytest.approx(lens.fx_px, rel=2e-3)
 
 
-def test_frames_before_the_inertial_data_stay_in_their_place(tmp_path: Path) -> None:
-    """A gyroscope that begins 0.15 s late leaves the first frames out, and no other frame takes their numbers."""
+def test_frames_before_the_inertial_data_keep_their_numbers(tmp_path: Path) -> None:
+    """A gyroscope that starts 0.15 s late excludes the first frames without renumbering the others."""
     folder = tmp_path / "late"
     simulate_command(folder, width=240, height=320, frames=26, seed=3, rate_rad_s=1.0, exposure_ms=8)
     begin_ns = int((folder / "frame_timestamps.txt").read_text(encoding="utf-8").splitlines()[1].split(",")[0])
@@ -96,8 +96,8 @@ def test_frames_before_the_inertial_data_stay_in_their_place(tmp_path: Path) -> 
     assert found.nominal.blur_rms_px is not None
 
 
-def test_the_next_frame_stands_for_one_at_no_known_time() -> None:
-    """What H.264 remembers of a frame without exposure or without inertial data is not made up."""
+def test_a_frame_without_exposure_or_imu_is_replaced_by_the_next() -> None:
+    """The encoder's memory of such a frame cannot be predicted."""
     frames = [Frame(k, 10**9 * k, 0.03 * k, 0.01) for k in range(6)]
     frames[3] = replace(frames[3], skip_reason="no IMU", skip_codes=("no-imu",))
     frames[2] = replace(frames[2], exposure_s=None)
@@ -112,8 +112,8 @@ def test_no_tiles_have_no_transfers() -> None:
     assert transfers(join_ratios([]), camera.profile, trajectory).shape == (0, 2, MEMORY, bin_count())
 
 
-def test_gains_of_frames_that_no_patch_shows_are_unknown(rng: np.random.Generator, monkeypatch) -> None:
-    """Frames that the fit does not see take their neighbours' gain, and its deviation is unknown."""
+def test_gains_of_frames_without_patches_are_unknown(rng: np.random.Generator, monkeypatch) -> None:
+    """Such frames take their neighbours' gain, with an unknown deviation."""
     from diagnosis.test_photometry import FRAMES, NOMINAL, hidden, made_observations
 
     gain = np.exp(0.1 * np.sin(0.4 * np.arange(FRAMES)))
@@ -131,8 +131,8 @@ def test_gains_of_frames_that_no_patch_shows_are_unknown(rng: np.random.Generato
     np.testing.assert_allclose(np.log(change.estimate[9:14]), np.log(gain[9:14] / np.median(gain)), atol=0.04)
 
 
-def test_pictures_of_another_motion_tell_no_unknown_values() -> None:
-    """Where pictures do not follow the gyroscope, readout, lens and clock stay as they were."""
+def test_frames_of_another_motion_determine_no_unknown_values() -> None:
+    """If frames do not follow the gyroscope, unknown readout, lens and offset are not fitted."""
     camera, other = Recording(replace(HAND, frames=80)), Recording(replace(HAND, seed=8, frames=80))
     unknown = replace(camera.profile, intrinsics=None, time_offset_s=None, readout_known=False)
     stranger = SimpleNamespace(imu=other.imu, repeats=())
@@ -146,8 +146,8 @@ def test_pictures_of_another_motion_tell_no_unknown_values() -> None:
     }  # fmt: skip
 
 
-def test_a_value_at_the_end_of_what_can_be_is_no_cause() -> None:
-    """A readout of 0.29 ms is significant by its deviation, and no sensor's."""
+def test_a_value_at_its_physical_limit_is_not_a_cause() -> None:
+    """A readout time of 0.29 ms is significant but impossible for a sensor."""
     camera = Recording(HAND)
     evidence = make_evidence(camera.imu, camera.observed)
     effect = next(effect for effect in GEOMETRIC_EFFECTS if effect.name == "readout_time")
@@ -159,8 +159,8 @@ def test_a_value_at_the_end_of_what_can_be_is_no_cause() -> None:
         assert (p_if_plausible(evidence, fitted, effect, found, camera.profile) == 1.0) is expected
 
 
-def test_an_unknown_readout_of_the_other_sense_is_turned_about() -> None:
-    """The fit of an unknown readout passes through zero; what it leaves has a positive one."""
+def test_an_unknown_readout_of_the_other_direction_is_reversed() -> None:
+    """The fit passes through zero; a negative readout time becomes a positive one in the other direction."""
     camera = Recording(HAND)
     evidence = make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), camera.observed)
     shutter = replace(camera.profile.shutter, readout_time_s=0.0, readout_direction="bottom_to_top")
@@ -170,8 +170,8 @@ def test_an_unknown_readout_of_the_other_sense_is_turned_about() -> None:
     assert found.shutter.readout_time_s == pytest.approx(camera.profile.shutter.readout_time_s, abs=1e-3)
 
 
-def test_an_offset_without_exposures_may_be_an_exposure() -> None:
-    """Where exposures are unknown an offset has them as its rival."""
+def test_an_offset_without_exposures_has_the_exposure_as_rival() -> None:
+    """Unknown exposures could also explain an offset."""
     change = {"time_offset_s": ParameterChange(0.0, 0.004, 1e-5)}
     finding = Finding("time_offset", change, HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1), (), 1e-9, "")
     verdict = SimpleNamespace(nominal=Model(CameraProfile(640, 480), None, ()))
@@ -185,8 +185,8 @@ def test_an_offset_without_exposures_may_be_an_exposure() -> None:
     (-0.0005, 0.001, "time_offset"),
     (-0.0025, 0.001, "timestamp_reference"),
 ])  # fmt: skip
-def test_an_offset_hardly_known_is_no_timestamp_reference(shift_s: float, std_s: float, name: str) -> None:
-    """At 6 ms the middle of the exposure is 3 ms away; a wide deviation does not bring 0.5 ms near it."""
+def test_an_uncertain_offset_is_not_a_timestamp_reference(shift_s: float, std_s: float, name: str) -> None:
+    """With 6 ms exposure the middle is 3 ms away; a large deviation does not make 0.5 ms compatible with it."""
     change = {"time_offset_s": ParameterChange(0.004, 0.004 + shift_s, std_s)}
     finding = Finding("time_offset", change, HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1), (), 1e-9, "")
     model = Model(replace(CameraProfile(640, 480), time_offset_s=0.004), None, ())

@@ -1,4 +1,4 @@
-"""Deviations of causes while points stay astray: what a cause outside the model would move counts."""
+"""Deviations of causes include the effect of causes outside the model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HAND = Setup(seed=71, frames=31, points=15, gyro_noise_rad_s=0.001)
 
 @lru_cache(maxsize=1)
 def recording() -> Recording:
-    """Made once."""
+    """The recording, made only once."""
     return Recording(HAND)
 
 
@@ -40,8 +40,8 @@ def left_open(given: CameraProfile, further: tuple[str, ...]) -> tuple[float, fl
     return error, float(fitted.std("time_offset")[0] ** 2), float(found["time_offset"][0])
 
 
-def test_a_cause_outside_the_model_widens_what_it_would_move() -> None:
-    """With a readout that is wrong and nobody to say so, the offset errs by more than its own deviation tells."""
+def test_a_cause_outside_the_model_widens_the_deviation() -> None:
+    """With a wrong readout time outside the model, the offset's error exceeds its own deviation."""
     truth = recording().profile
     given = replace(truth, shutter=replace(truth.shutter, readout_time_s=truth.shutter.readout_time_s - 0.012))
     error, own, opened = left_open(given, ("gyro_bias", "readout_time", "imu_rotation"))
@@ -49,8 +49,8 @@ def test_a_cause_outside_the_model_widens_what_it_would_move() -> None:
     assert error**2 < 4 * (own + opened)
 
 
-def test_a_right_model_is_as_sure_as_its_covariance() -> None:
-    """Where nothing is missing, no further cause moves the value by more than its own freedom."""
+def test_a_complete_model_keeps_its_covariance() -> None:
+    """If no cause is missing, other causes hardly change the parameter."""
     truth = recording().profile
     _, own, opened = left_open(truth, ("gyro_bias", "focal_length", "imu_rotation", "readout_time"))
     assert opened < 4 * own

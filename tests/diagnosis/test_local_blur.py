@@ -1,4 +1,4 @@
-"""Local blur: widths of edges and ratios of spectra find exposure time and defocus, and keep quiet otherwise."""
+"""Local blur: widths of edges and ratios of spectra determine exposure time and defocus without false alarms."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -51,7 +51,7 @@ BOTH = (ExposureTime(), Defocus())
 
 
 def observed(folder: Path, seed: int, *effects: str, bits_per_px: float = 0.5) -> Observed:
-    """A short simulated capture, its nominal profile, and what its pictures show."""
+    """A short simulated capture's blur observations, nominal profile and trajectory."""
     simulate_command(
         folder, width=448, height=336, frames=42, exposure_ms=[13.0, 8.0, 10.0], rate_rad_s=1.3, seed=seed,
         bitrate_bits_per_px=bits_per_px, effects=effects, truth_frames=False,
@@ -67,7 +67,7 @@ def observed(folder: Path, seed: int, *effects: str, bits_per_px: float = 0.5) -
 
 @pytest.fixture(scope="module")
 def nominal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the capture with nothing hidden lies."""
+    """Folder of the capture with nothing hidden."""
     return tmp_path_factory.mktemp("null") / "trip"
 
 
@@ -79,13 +79,13 @@ def nominal(nominal_folder: Path) -> Observed:
 
 @pytest.fixture(scope="module")
 def altered(tmp_path_factory: pytest.TempPathFactory) -> Observed:
-    """A capture exposed 1.5 times as long as logged, and out of focus by 1.3 px."""
+    """A capture exposed 1.5 times as long as logged, and defocused by 1.3 px."""
     return observed(tmp_path_factory.mktemp("both") / "trip", 52, "exposure_time=1.5", "defocus=1.3")
 
 
 @pytest.mark.parametrize("direction", ["bottom_to_top", "left_to_right"])
-def test_paths_are_those_of_the_kernels(direction: str) -> None:
-    """Of all frames at once, the paths' covariances are those of the kernels that restoration takes, lens in motion."""
+def test_blur_path_covariances_match_the_kernels(direction: str) -> None:
+    """Covariances computed for all frames at once equal those of restoration's kernels, with a moving lens."""
     lens = Intrinsics(320, 240, 261.0, 255.0, 151.0, 128.0, "radtan", (-0.06, 0.01, 0.001, -0.002, 0.0))
     extensions = Extensions(focal_drift_per_s=0.02, stabilisation_fraction=0.4, stabilisation_cutoff_hz=0.7)
     shutter = Shutter(0.023, direction, exposure_scale=1.2)
@@ -103,10 +103,10 @@ def test_paths_are_those_of_the_kernels(direction: str) -> None:
             np.testing.assert_allclose(found[k, place], [xx, xy, yy], atol=3e-3 * (xx + yy))
 
 
-def test_parts_of_a_capture_show_what_all_of_it_shows(
+def test_measuring_in_parts_gives_the_same_observations(
     nominal: Observed, nominal_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Measured part by part, edges and spectra are those of one stream."""
+    """Edges and spectra measured in parts equal those of one pass."""
     monkeypatch.setattr(local_blur, "frames_to_read", lambda capture: [3, 5, 7, 8, 9, 12])
     capture, (_, profile, trajectory) = read_capture(nominal_folder, look_at_pictures=False), nominal
     gray = GrayReader(capture.movie, probe_movie(capture.movie))
@@ -119,10 +119,10 @@ def test_parts_of_a_capture_show_what_all_of_it_shows(
     assert len(whole.ratios) > 0
 
 
-def test_steps_that_blur_came_by_are_those_of_the_pictures(
+def test_blur_returns_the_edge_profiles_of_sharpening(
     nominal: Observed, nominal_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Sharpening is judged by them: frames that two parts share count once, and no picture is read a second time."""
+    """Frames shared by two parts count once, and sharpening is judged without reading a frame again."""
     monkeypatch.setattr(local_blur, "frames_to_read", lambda capture: [3, 5, 7, 8, 9, 12])
     capture, (_, profile, trajectory) = read_capture(nominal_folder, look_at_pictures=False), nominal
     gray = GrayReader(capture.movie, probe_movie(capture.movie))
@@ -140,7 +140,7 @@ def test_steps_that_blur_came_by_are_those_of_the_pictures(
 
 
 def test_the_width_of_a_blurred_step_is_found(rng: np.random.Generator) -> None:
-    """A step spread by 0.8 to 3 px, off centre, upon any level, comes back within a hundredth."""
+    """The width of a step of 0.8 px to 3 px, off centre and at any level, is found within 1 %."""
     u = np.arange(-14, 14.01, 0.5)
     width, centre = rng.uniform(0.8, 3.0, 40), rng.uniform(-0.6, 0.6, 40)
     steps = 0.3 + 0.2 * erf((u - centre[:, None]) / (np.sqrt(2) * width[:, None]))
@@ -149,8 +149,8 @@ def test_the_width_of_a_blurred_step_is_found(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(found_centre, centre, atol=0.01)
 
 
-def test_lines_and_waves_are_no_steps() -> None:
-    """A thin line and a sine have slopes as strong as a step's, and no width."""
+def test_lines_and_waves_are_not_steps() -> None:
+    """A thin line and a sine have slopes as strong as a step's but no width."""
     u = np.arange(-19, 19.01, 0.5)
     line = np.exp(-0.5 * (u / 1.5) ** 2)
     wave = np.sin(2 * np.pi * u / 9)
@@ -162,7 +162,7 @@ def test_lines_and_waves_are_no_steps() -> None:
 
 
 def crowded(rng: np.random.Generator, width_px: float) -> EdgeWidths:
-    """Widths that profiles show of steps whose widths scatter by 15 %, each with another step at some distance."""
+    """Measured widths of steps whose widths scatter by 15 %, each with another step at some distance."""
     u, beside = np.arange(-19, 19.01, 0.5), 8.0 + 6.0 * rng.exponential(1.0, 3000)
     own = width_px * np.exp(rng.normal(0, 0.15, 3000))[:, None]
     steps = erf(u / (np.sqrt(2) * own)) - 0.7 * erf((u - beside[:, None]) / (np.sqrt(2) * own))
@@ -174,8 +174,8 @@ def crowded(rng: np.random.Generator, width_px: float) -> EdgeWidths:
 
 
 @pytest.mark.parametrize("width_px", [2.1, 2.6, 3.1])
-def test_edges_with_others_beside_them_do_not_seem_narrow(rng: np.random.Generator, width_px: float) -> None:
-    """Few stand alone over a long way, so those that hold their own width are the narrow ones: 4 % too narrow."""
+def test_crowded_edges_are_not_measured_too_narrow(rng: np.random.Generator, width_px: float) -> None:
+    """Selecting edges isolated over their own width favours narrow ones by more than 3 %."""
     seen = crowded(rng, width_px)
     own, even = isolated_edges(seen).width_px, evenly_isolated(seen, 40).width_px
     assert np.median(own) < 0.968 * width_px
@@ -183,8 +183,8 @@ def test_edges_with_others_beside_them_do_not_seem_narrow(rng: np.random.Generat
     assert np.median(even) == pytest.approx(width_px, rel=0.03)
 
 
-def test_where_too_few_stand_alone_each_has_its_own_reach(rng: np.random.Generator) -> None:
-    """Few edges over one reach tell less than more of them over their own."""
+def test_too_few_evenly_isolated_edges_use_their_own_reach(rng: np.random.Generator) -> None:
+    """Few edges with a common reach carry less information than more edges with their own."""
     seen = crowded(rng, 3.1)
     own = isolated_edges(seen)
     np.testing.assert_array_equal(evenly_isolated(seen, len(own)).width_px, own.width_px)
@@ -192,16 +192,16 @@ def test_where_too_few_stand_alone_each_has_its_own_reach(rng: np.random.Generat
     assert share_a_reach(evenly_isolated(seen, 40))
 
 
-def test_widths_add_in_squares_up_to_the_shape_of_a_path() -> None:
-    """No motion: the Gaussian's width; a long path is a ramp, which a Gaussian fits about 1.14 times as wide."""
+def test_widths_add_in_quadrature_up_to_the_shape_of_a_path() -> None:
+    """Without motion the width is the Gaussian's; a long path gives a ramp, to which a wider Gaussian is fitted."""
     u, path = np.arange(-12, 12.01, 0.5), np.sqrt(12) * 3.0 * (np.arange(400) / 399 - 0.5)
     ramp = erf((u[:, None] - path) / (np.sqrt(2) * 0.5)).mean(axis=1)
     assert fitted_width(np.array([0.0]), 1.2, 0.5)[0] == pytest.approx(1.3, rel=1e-3)
     assert fitted_width(np.array([3.0]), 0.0, 0.5)[0] == pytest.approx(fit_steps(ramp[None], 12.0)[1][0], rel=0.03)
 
 
-def test_an_exposure_at_the_end_of_the_range_is_no_estimate(nominal: Observed) -> None:
-    """Pictures that show nothing of the blur that is predicted would want no exposure at all: it stays open."""
+def test_an_exposure_at_the_end_of_its_range_is_undetermined(nominal: Observed) -> None:
+    """Frames without the predicted blur would require a zero exposure; the value stays undetermined."""
     observations, profile, trajectory = nominal
     none_seen = replace(observations.ratios, log_ratio=0.0 * observations.ratios.log_ratio)
     found = fit(replace(observations, ratios=none_seen), profile, trajectory, BOTH)
@@ -211,7 +211,7 @@ def test_an_exposure_at_the_end_of_the_range_is_no_estimate(nominal: Observed) -
 
 
 def test_a_nominal_capture_stays_nominal(nominal: Observed) -> None:
-    """Neither effect is significant, though both are determined."""
+    """Neither effect is significant, although both are determined."""
     found = fit(*nominal, BOTH)
     scale, sigma = found.values[0][0], found.values[1][0]
     assert found.determined == (True, True)
@@ -221,7 +221,7 @@ def test_a_nominal_capture_stays_nominal(nominal: Observed) -> None:
 
 
 def test_exposure_and_defocus_are_found_together(altered: Observed) -> None:
-    """Both come back within three deviations and a tenth, and help on time blocks that did not fit them."""
+    """Both lie within three deviations and 12 % of the truth, and improve held-out time blocks."""
     found = fit(*altered, BOTH)
     for value, truth, std in zip(np.concatenate(found.values), (1.5, 1.3), found.std, strict=True):
         assert abs(value - truth) < 3 * std
@@ -233,16 +233,16 @@ def test_exposure_and_defocus_are_found_together(altered: Observed) -> None:
     assert of_defocus.after < 0.4 * of_defocus.before
 
 
-def test_a_deviation_holds_what_all_widths_have_in_common(altered: Observed) -> None:
-    """Which edges stand alone depends on how wide they seem: all of a capture's may be told a little too wide."""
+def test_a_deviation_includes_a_common_error_of_all_widths(altered: Observed) -> None:
+    """The selection of isolated edges depends on their apparent width, so all widths may be slightly too large."""
     observations, *rest = altered
     wider = replace(observations.edges, width_px=(1 + EDGE_STD) * observations.edges.width_px)
     one, other = fit(observations, *rest, BOTH), fit(replace(observations, edges=wider), *rest, BOTH)
     assert 0 < other.values[1][0] - one.values[1][0] < one.std[1]
 
 
-def test_the_profile_alone_carries_the_effects(altered: Observed) -> None:
-    """The residuals of the true profile are smaller than the nominal one's, with nothing fitted."""
+def test_the_profile_alone_describes_the_effects(altered: Observed) -> None:
+    """Without any fit, the true profile has smaller residuals than the nominal one."""
     observations, profile, trajectory = altered
     true = Defocus().apply(ExposureTime().apply(profile, np.array([1.5])), np.array([1.3]))
     plain, right = (residuals(observations, p, trajectory) for p in (profile, true))
@@ -252,8 +252,8 @@ def test_the_profile_alone_carries_the_effects(altered: Observed) -> None:
     assert np.median(np.abs(right[~edge])) < np.median(np.abs(plain[~edge]))
 
 
-def test_a_scene_of_smooth_things_is_not_called_defocused(rng: np.random.Generator, altered: Observed) -> None:
-    """Smooth texture has next to no isolated steps: defocus is not determined, whatever its slopes' widths."""
+def test_a_smooth_scene_is_not_reported_as_defocused(rng: np.random.Generator, altered: Observed) -> None:
+    """Smooth texture has few isolated steps, so the defocus stays undetermined."""
     texture = cv2.GaussianBlur(rng.normal(size=(336, 448)), (0, 0), 3.0)
     picture = np.clip(120 + 45 * texture / texture.std(), 1, 250).astype(np.uint8)
     frame = Frame(0, 0, 0.0, 0.01)
@@ -267,8 +267,8 @@ def test_a_scene_of_smooth_things_is_not_called_defocused(rng: np.random.Generat
     assert np.isinf(found.std).all()
 
 
-def test_a_starved_encoder_shortens_no_exposure(nominal: Observed, tmp_path: Path) -> None:
-    """Few bits bring spectra closer together, as shorter exposures would; the fit allows for it, and doubts more."""
+def test_a_low_bit_rate_does_not_shorten_the_exposure(nominal: Observed, tmp_path: Path) -> None:
+    """Few bits make spectra more similar, as shorter exposures do; the fit reports a larger deviation."""
     starved = observed(tmp_path / "trip", 51, bits_per_px=0.1)
     assert starved[0].bits_per_px == pytest.approx(0.1, rel=0.2)
     found, rich = fit(*starved, (ExposureTime(),)), fit(*nominal, (ExposureTime(),))

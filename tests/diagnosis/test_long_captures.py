@@ -1,4 +1,4 @@
-"""What is looked at of captures that are too long to be looked at whole."""
+"""The parts of long captures that a diagnosis uses."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from virest.diagnosis.picture_ladder import MAX_LIGHT_FRAMES, WHOLE_LIGHT_FRAMES
 
 
 def frames_with(exposure_s: np.ndarray) -> list[Frame]:
-    """Thirty a second, at ISO 200."""
+    """Frames at 30 per second and ISO 200."""
     return [Frame(k, k * 33_333_333, k / 30, float(e), 200.0) for k, e in enumerate(exposure_s)]
 
 
 def test_brightness_is_judged_where_exposures_vary() -> None:
-    """Of a minute whose exposure walks only between 35 and 38 s, the stretch lies about those seconds."""
+    """The exposure changes only between 35 s and 38 s, and the selected frames include that time."""
     exposure_s = np.full(1800, 0.008)
     exposure_s[1050:1140] = np.geomspace(0.008, 0.003, 90)
     exposure_s[1140:] = 0.003
@@ -28,8 +28,8 @@ def test_brightness_is_judged_where_exposures_vary() -> None:
     assert stretch[-1].index > 1120
 
 
-def test_at_constant_exposure_the_stretch_lies_in_the_middle() -> None:
-    """Nothing tells one stretch from another: the middle it is; and a short capture is taken whole."""
+def test_at_constant_exposure_the_middle_is_used() -> None:
+    """No other part is preferable; a short capture is used completely."""
     frames = frames_with(np.full(1001, 0.006))
     stretch = light_stretch(frames)
     assert abs(0.5 * (stretch[0].index + stretch[-1].index) - 500) < 25
@@ -37,7 +37,7 @@ def test_at_constant_exposure_the_stretch_lies_in_the_middle() -> None:
 
 
 def test_a_camera_of_half_the_size_sees_the_same_rays() -> None:
-    """What lies at pixel x of a picture lies at (x − ½) / 2 of the halved one, distortion and all."""
+    """Pixel x of a frame corresponds to (x − ½) / 2 of the halved frame, including distortion."""
     lens = Intrinsics(1281, 720, 1010.0, 990.0, 655.0, 349.0, "radtan", (-0.08, 0.02, 0.001, -0.002, 0.0))
     half = halved_profile(CameraProfile(1281, 720, intrinsics=lens)).intrinsics
     assert half is not None

@@ -1,4 +1,4 @@
-"""Hidden photometric effects come back from brightness alone, and nothing comes back where nothing is hidden."""
+"""Hidden photometric effects are recovered from brightness alone, without false alarms."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def made_observations(
     exposures_s: tuple[float, ...] = (0.007,),
     patches: int = 150,
 ) -> PhotometricObservations:
-    """Patches that wander through the picture, their grey written down from the contract's model.
+    """Patches that move through the frame, with grey levels from the documented model.
 
-    products: spread of the logged exposure × ISO, in log light.  pace: of its walk, radians a frame.  exposures_s: of
-    the frames, in turn.
+    ``products`` is the spread of the logged exposure × ISO in log light, ``pace`` the speed of its walk in rad per
+    frame, and ``exposures_s`` the frames' exposures in turn.
     """
     frame = np.tile(np.arange(FRAMES), patches)
     patch = np.repeat(np.arange(patches), FRAMES)
@@ -94,23 +94,23 @@ def made_observations(
 
 
 def hidden(gamma: float = 1.0, black: float = 0.0, **extensions: object) -> CameraProfile:
-    """Put effects into the nominal profile."""
+    """The nominal profile with hidden effects."""
     curve = ResponseCurve("srgb", extra_gamma=gamma, black_level=black)
     return replace(NOMINAL, response=curve, extensions=Extensions(**extensions))  # type: ignore[arg-type]
 
 
-def test_the_true_profile_leaves_nothing_but_noise(rng: np.random.Generator) -> None:
-    """Under the profile that made the observations, residuals are as large as the noise, whatever the effects."""
+def test_the_true_profile_leaves_only_noise(rng: np.random.Generator) -> None:
+    """With the profile that made the observations, residuals equal the noise."""
     true = hidden(1.25, 0.04, vignetting_corner_loss=0.35, flicker_amplitude=0.2, flicker_frequency_hz=120.0)
     left = residuals(made_observations(true, rng, 0.3), true)
     assert np.std(left) == pytest.approx(NOISE, rel=0.03)
     assert np.std(residuals(made_observations(true, rng, 0.3), NOMINAL)) > 4 * NOISE
 
 
-def test_a_shadow_on_one_side_is_a_field_and_a_vignette_is_none(rng: np.random.Generator) -> None:
-    """A fifth less on one side, beside a vignette that the profile has; the map comes back, and nothing without it.
+def test_a_shadow_on_one_side_is_a_field_of_gain(rng: np.random.Generator) -> None:
+    """The map is recovered beside a vignette in the profile; without the shadow there is none.
 
-    Where all patches move alike an even slope is a gain of each frame: only how the map bends can be told.
+    If all patches move alike, an even slope equals a gain per frame: only the curvature of the map is determined.
     """
 
     def shadow(x_px):
@@ -132,8 +132,8 @@ def test_a_shadow_on_one_side_is_a_field_and_a_vignette_is_none(rng: np.random.G
     assert light_field(replace(observed, grey=grey), with_light_field(profile, found)) is None
 
 
-def test_flicker_that_stands_still_is_a_shadow_where_that_explains_more(rng: np.random.Generator) -> None:
-    """A shadow over the rows is not told as a lamp of the frames' rate; a lamp of a multiple of it stays one."""
+def test_stationary_flicker_is_replaced_by_a_shadow(rng: np.random.Generator) -> None:
+    """A shadow over the rows is not reported as a light at the frame rate; a light at a multiple of it stays."""
     standing = {"flicker_amplitude": 0.03, "flicker_frequency_hz": 29.7, "flicker_phase_rad": 1.0}
     observed = made_observations(hidden(), rng)
     factor = 1 - 0.2 * (observed.x_px / 639) ** 3 - 0.1 * (observed.y_px / 479) ** 3
@@ -148,20 +148,20 @@ def test_flicker_that_stands_still_is_a_shadow_where_that_explains_more(rng: np.
 
 
 def dimmed(observed: PhotometricObservations, factor: NDArray[np.float64]) -> PhotometricObservations:
-    """The patches under less light, (n,)."""
+    """The patches with their light multiplied by a factor (n,)."""
     linear = NOMINAL.response.linearise(observed.grey / 255) * factor
     return replace(observed, grey=np.asarray(NOMINAL.response.encode(linear)) * 255)
 
 
 def named(observed: PhotometricObservations) -> dict[str, PictureVerdict]:
-    """What the ladder of brightness says, by the causes that it names."""
+    """The verdict of the brightness ladder, by the causes that it names."""
     verdict = PictureVerdict(NOMINAL)
     climb_observations(verdict, observed, FRAMES)
     return dict.fromkeys([finding.name for finding in verdict.findings], verdict)
 
 
-def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(rng: np.random.Generator) -> None:
-    """It stands on one side, comes over it for a while, or passes through; a cloud before the sun dims all alike."""
+def test_a_shadow_over_part_of_the_frame_is_not_a_global_cause(rng: np.random.Generator) -> None:
+    """The shadow is static, temporary or moving. Dimming of the whole frame is a gain drift."""
     observed = made_observations(hidden(), rng, patches=80)
     x, t = observed.x_px / 639, observed.frame / FRAMES
     side, while_there = 1 / (1 + np.exp(-(x - 0.5) / 0.06)), np.exp(-(((t - 0.5) / 0.2) ** 2))
@@ -175,7 +175,7 @@ def test_a_shadow_over_a_part_of_the_picture_is_no_cause_of_the_whole(rng: np.ra
 
 
 def test_a_vignette_keeps_its_name_beside_a_shadow(rng: np.random.Generator) -> None:
-    """And nearly its size; the lamps, whose frequency would be that of the frames, are not blamed."""
+    """Its size is nearly right, and no flicker at the frame rate is named."""
     observed = made_observations(hidden(vignetting_corner_loss=0.2), rng, patches=80)
     shade = 1 / (1 + np.exp(-(observed.x_px / 639 - 0.6) / 0.06))
     found = named(dimmed(observed, 1 - 0.2 * shade))
@@ -183,8 +183,11 @@ def test_a_vignette_keeps_its_name_beside_a_shadow(rng: np.random.Generator) -> 
     assert found["vignetting"].profile.extensions.vignetting_corner_loss == pytest.approx(0.2, abs=0.05)
 
 
-def test_a_slope_of_the_light_is_no_gain_that_follows_the_camera(rng: np.random.Generator) -> None:
-    """Where all patches move alike the two are the same for patches; the few numbers are told, and the rival is."""
+def test_a_slope_of_the_light_is_not_a_gain_drift(rng: np.random.Generator) -> None:
+    """For patches that move alike both are equivalent.
+
+    The slope with few parameters is reported, with the gain drift as rival.
+    """
     observed = made_observations(hidden(), rng, patches=80)
     found = named(dimmed(observed, 1 - 0.15 * observed.x_px / 639))
     verdict = found["gain_drift"]
@@ -202,8 +205,8 @@ def test_a_slope_of_the_light_is_no_gain_that_follows_the_camera(rng: np.random.
     assert instead_of_cause(drift.observations, drift.profile, ["gain_drift"])[2] is None
 
 
-def test_each_effect_comes_back_within_its_deviation(rng: np.random.Generator) -> None:
-    """Vignetting and flicker are found at a constant exposure, gamma and black level where it changes."""
+def test_each_effect_is_recovered_within_its_deviation(rng: np.random.Generator) -> None:
+    """Vignetting and flicker are found at a constant exposure, gamma and black level with a changing one."""
     observed = made_observations(hidden(vignetting_corner_loss=0.35), rng)
     fit = fit_photometry(observed, NOMINAL, [VIGNETTING])
     assert fit.values[0] == pytest.approx(0.35, abs=3 * fit.std[0] + 1e-9)
@@ -215,14 +218,14 @@ def test_each_effect_comes_back_within_its_deviation(rng: np.random.Generator) -
     fit = fit_photometry(made_observations(hidden(1.2, 0.05), rng, 0.25), NOMINAL, [RESPONSE_GAMMA, BLACK_LEVEL])
     np.testing.assert_array_less(np.abs(fit.values - (1.2, 0.05)), 4 * fit.std)
     np.testing.assert_array_less(fit.std, (0.03, 0.01))
-    # the deviation of each knows of the other: alone they would look better known
+    # both deviations include the correlation, which makes them larger than with one effect alone
     alone = fit_photometry(made_observations(hidden(1.2, 0.05), rng, 0.25), hidden(1.2), [BLACK_LEVEL])
     floor = RESOLUTION["black_level"] ** 2
     assert fit.covariance[1, 1] - floor > 1.5 * (alone.covariance[0, 0] - floor)
 
 
-def test_gains_are_judged_on_other_places(rng: np.random.Generator) -> None:
-    """A gain per frame comes back, median 1, and holds for patches that it was not fitted to."""
+def test_gains_are_judged_on_other_patches(rng: np.random.Generator) -> None:
+    """Gains per frame are recovered with median 1 and hold for patches that were not fitted."""
     gain = np.exp(0.08 * np.sin(0.9 * np.arange(FRAMES)) + 0.05 * np.cos(0.21 * np.arange(FRAMES)))
     gain /= np.median(gain)
     observed = made_observations(hidden(gain=tuple(gain)), rng)
@@ -230,14 +233,14 @@ def test_gains_are_judged_on_other_places(rng: np.random.Generator) -> None:
     fit = fit_photometry(observed, NOMINAL, [effect])
     off = np.log(fit.profile.extensions.gain) - np.log(gain)
     assert np.median(fit.profile.extensions.gain) == pytest.approx(1.0, abs=1e-6)
-    # these patches share no errors, which the deviations allow for
+    # the errors of these patches are independent, while the deviations allow for correlated ones
     assert 0.15 < np.std(off / fit.std) < 1.3
     held = judge(observed, NOMINAL, [effect])
     assert held.gain > 0.98
 
 
-def test_constant_exposure_leaves_the_curve_open(rng: np.random.Generator) -> None:
-    """Where no light factor changes, brightness says nothing about gamma or black level, and the fit says so."""
+def test_constant_exposure_leaves_the_curve_undetermined(rng: np.random.Generator) -> None:
+    """Without a change of light, brightness does not determine gamma or black level: deviations are large."""
     observed = made_observations(hidden(1.2, 0.05), rng)
     for effect, wide in ((RESPONSE_GAMMA, 0.3), (BLACK_LEVEL, 0.03)):
         fit = fit_photometry(observed, NOMINAL, [effect])
@@ -246,15 +249,15 @@ def test_constant_exposure_leaves_the_curve_open(rng: np.random.Generator) -> No
 
 
 def test_flicker_that_the_exposure_averages_away_is_not_found(rng: np.random.Generator) -> None:
-    """At an exposure of a whole number of periods the lamp leaves no trace."""
+    """An exposure of a whole number of periods removes the flicker."""
     observed = made_observations(hidden(flicker_amplitude=0.4, flicker_frequency_hz=1 / 0.007), rng)
     fit = fit_photometry(observed, NOMINAL, [Flicker()])
     assert significance(fit, "flicker", observed, NOMINAL)[1] > 1e-3
 
 
 @pytest.mark.parametrize("exposures_s", [(0.013, 0.008, 0.010), (0.012, 0.007)])
-def test_exposures_in_turn_do_not_lead_flicker_astray(exposures_s: tuple[float, ...], rng: np.random.Generator) -> None:
-    """Each averages the light by its own factor, of either sign: the rhythm of the exposures is none of the lamp's."""
+def test_alternating_exposures_do_not_bias_flicker(exposures_s: tuple[float, ...], rng: np.random.Generator) -> None:
+    """Each exposure averages the light by its own factor; the exposures' rhythm is not that of the light."""
     lamp = hidden(flicker_amplitude=0.3, flicker_frequency_hz=120.0, flicker_phase_rad=2.0)
     fit = fit_photometry(made_observations(lamp, rng, exposures_s=exposures_s), NOMINAL, [Flicker()])
     assert fit.values[1] == pytest.approx(120.0, abs=0.02)
@@ -262,7 +265,7 @@ def test_exposures_in_turn_do_not_lead_flicker_astray(exposures_s: tuple[float, 
 
 
 def test_the_memory_of_an_encoder_does_not_weaken_flicker(rng: np.random.Generator) -> None:
-    """A movie that follows brightness slowly still gives the lamp's own amplitude and phase."""
+    """A movie that follows brightness slowly still gives the light's own amplitude and phase."""
     lamp = hidden(flicker_amplitude=0.2, flicker_frequency_hz=100.0, flicker_phase_rad=1.0)
     observed = made_observations(lamp, rng)
     slow = replace(observed, grey=remembered(observed.with_memory(0.3), observed.grey))
@@ -274,10 +277,10 @@ def test_the_memory_of_an_encoder_does_not_weaken_flicker(rng: np.random.Generat
 
 
 @pytest.mark.parametrize("seen", [1.0, 0.3])
-def test_noise_is_not_what_changes_the_light(rng: np.random.Generator, seen: float) -> None:
-    """Light that changes by a third from frame to frame, a lamp and an unknown curve are no noise.
+def test_noise_excludes_changes_of_the_light(rng: np.random.Generator, seen: float) -> None:
+    """A changing exposure, flicker and an unknown curve do not count as noise.
 
-    Nor where patches are seen for a part of the movie only, each at other exposures.
+    Nor does it matter if patches are seen only in a part of the movie, each at other exposures.
     """
     lamp = {"flicker_amplitude": 0.2, "flicker_frequency_hz": 120.0}
     observed = made_observations(hidden(1.2, 0.05, vignetting_corner_loss=0.3, **lamp), rng, 0.3)
@@ -288,8 +291,8 @@ def test_noise_is_not_what_changes_the_light(rng: np.random.Generator, seen: flo
     assert np.quantile(found, 0.95) < 2 * NOISE
 
 
-def test_gains_do_not_take_what_the_curve_explains(rng: np.random.Generator) -> None:
-    """A gamma under exposures that change is one cause, although a free gain for every frame removes as much."""
+def test_gains_do_not_replace_a_gamma(rng: np.random.Generator) -> None:
+    """A gamma with changing exposures is one cause, although a free gain per frame would remove as much."""
     observed = measured_noise(made_observations(hidden(1.15), rng, 0.2), NOMINAL.response)
     verdict = PictureVerdict(NOMINAL)
     climb_observations(verdict, observed, FRAMES)
@@ -297,17 +300,17 @@ def test_gains_do_not_take_what_the_curve_explains(rng: np.random.Generator) -> 
     assert cause.name == "response_curve"
     assert cause.parameters["gamma"].estimate == pytest.approx(1.15, abs=3 * cause.parameters["gamma"].std)
     assert cause.held_out.after < cause.held_out.before
-    # as measured beforehand, not as the fit leaves it
+    # the noise is the measured one, not the residual of the fit
     assert cause.held_out.noise == pytest.approx(np.sqrt(np.mean(observed.noise**2)), rel=0.02)
 
 
-# ── what blur mixes ────────────────────────────────────────────────────────────────────────────────────────────────
+# ── mixing by blur ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def mixing_evidence(rng: np.random.Generator, strength: float, gamma: float, agreement: float) -> MixingEvidence:
-    """Tiles of ten pairs of frames in which a change of the curve is ``strength`` noises at a pixel.
+    """Tiles of ten pairs of frames in which a change of the curve equals ``strength`` times the noise per pixel.
 
-    agreement: correlation of what the encoder left with such a change.
+    ``agreement`` is the correlation of the coding error with such a change.
     """
     pair, steps = np.repeat(np.arange(10), 40), np.log([0.8, 1.0, 1.25])
     pixels = np.full(len(pair), 1000.0)
@@ -321,8 +324,8 @@ def mixing_evidence(rng: np.random.Generator, strength: float, gamma: float, agr
     )  # fmt: skip
 
 
-def test_an_encoder_that_mixes_grey_is_no_gamma(rng: np.random.Generator) -> None:
-    """What agrees a little with a gamma in every pair is one only where light is mixed enough to outweigh it."""
+def test_an_encoder_that_mixes_grey_is_not_a_gamma(rng: np.random.Generator) -> None:
+    """A coding error that resembles a gamma in every pair is outweighed only if enough light is mixed."""
     false = mixing_evidence(rng, 0.12, 1.0, 0.07)
     found = estimate_mixing(false, NOMINAL, "response_curve")
     assert found is not None
@@ -334,13 +337,13 @@ def test_an_encoder_that_mixes_grey_is_no_gamma(rng: np.random.Generator) -> Non
     assert held is not None
     assert found.p_value < 1.5e-3
     assert found.value == pytest.approx(1.25, abs=2 * found.std)
-    # 1.5 noises of 1.5 levels at a pixel, times the change of log gamma, beside those 1.5 levels
+    # 1.5 times the noise of 1.5 levels per pixel, times the change of log gamma, added to these 1.5 levels
     assert held.before == pytest.approx(1.5 * np.sqrt(1 + 1.05 * (1.5 * np.log(1.25) + 0.07) ** 2), rel=0.02)
     assert held.after == pytest.approx(1.5, rel=0.02)
 
 
-def test_blocks_are_contiguous_and_of_several_lengths(rng: np.random.Generator) -> None:
-    """Time blocks never split a frame, follow one another, and do not repeat one length."""
+def test_time_blocks_are_contiguous_and_of_several_lengths(rng: np.random.Generator) -> None:
+    """Time blocks never split a frame, are consecutive, and vary in length."""
     observed = made_observations(NOMINAL, rng)
     block = time_blocks(observed)
     first = block[:FRAMES]
@@ -349,14 +352,14 @@ def test_blocks_are_contiguous_and_of_several_lengths(rng: np.random.Generator) 
     assert len(set(np.bincount(first)[:-1].tolist())) > 1
 
 
-# ── through a movie ────────────────────────────────────────────────────────────────────────────────────────────────
+# ── with a movie ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 Observe = Callable[..., tuple[PhotometricObservations, CameraProfile, CameraProfile]]
 
 
 @pytest.fixture
 def observe(tmp_path: Path) -> Observe:
-    """Simulate a small capture with hidden effects, and look at its patches with the nominal profile."""
+    """Simulate a small capture with hidden effects and observe its patches with the nominal profile."""
 
     def run(*effects: str, log_gains: bool = False, **options: object):
         folder = tmp_path / "capture"
@@ -375,8 +378,8 @@ def observe(tmp_path: Path) -> Observe:
     return run
 
 
-def test_vignetting_is_found_although_the_geometry_is_wrong(observe: Observe) -> None:
-    """A clock 10 ms off moves patches by several pixels; the loss at the corners still comes back."""
+def test_vignetting_is_found_despite_wrong_geometry(observe: Observe) -> None:
+    """A clock offset of 10 ms moves patches by several pixels; the corner loss is still recovered."""
     observed, nominal, true = observe("vignetting=0.4", "time_offset=0.01", rate_rad_s=1.4)
     fit = fit_photometry(observed, nominal, [VIGNETTING])
     assert fit.values[0] == pytest.approx(true.extensions.vignetting_corner_loss, abs=0.04)
@@ -385,8 +388,8 @@ def test_vignetting_is_found_although_the_geometry_is_wrong(observe: Observe) ->
     assert judge(observed, nominal, [VIGNETTING]).gain > 0.8
 
 
-def test_a_lamp_is_found_in_a_movie(observe: Observe) -> None:
-    """Amplitude and frequency of a flicker come back from rows and frames."""
+def test_flicker_is_found_in_a_movie(observe: Observe) -> None:
+    """Amplitude, frequency and phase are recovered from rows and frames."""
     observed, nominal, _ = observe("flicker=0.25,100,1.3", exposure_ms=8.0)
     fit = fit_photometry(observed, nominal, [Flicker()])
     assert fit.values[0] == pytest.approx(0.25, abs=0.03)
@@ -394,8 +397,8 @@ def test_a_lamp_is_found_in_a_movie(observe: Observe) -> None:
     assert np.sin(fit.values[2] - 1.3) == pytest.approx(0.0, abs=0.25)
 
 
-def test_a_curve_is_found_where_the_logged_light_changes(observe: Observe) -> None:
-    """With exposure × ISO that changes as logged, a gamma is found and no gain is."""
+def test_a_curve_is_found_with_changing_logged_light(observe: Observe) -> None:
+    """If exposure × ISO changes as logged, gamma is recovered."""
     observed, nominal, _ = observe("gain_drift=0.2", "response_curve=1.25", log_gains=True)
     fit = fit_photometry(observed, nominal, [RESPONSE_GAMMA])
     assert fit.values[0] == pytest.approx(1.25, abs=0.06)
@@ -403,8 +406,8 @@ def test_a_curve_is_found_where_the_logged_light_changes(observe: Observe) -> No
     assert log_light_factor(observed, nominal) == pytest.approx(observed.log_product)
 
 
-def test_nothing_hidden_nothing_found(observe: Observe) -> None:
-    """On a capture that its profile describes, no photometric effect is significant, at a wrong clock too."""
+def test_a_true_profile_has_no_photometric_effect(observe: Observe) -> None:
+    """No effect is significant for a capture that its profile describes, even with a wrong clock offset."""
     observed, nominal, _ = observe("time_offset=-0.008", scene="bright")
     noise = np.sqrt(np.mean(observed.noise**2))
     assert np.sqrt(np.mean(np.clip(residuals(observed, nominal), -4, 4) ** 2)) < 1.6 * noise
@@ -414,7 +417,7 @@ def test_nothing_hidden_nothing_found(observe: Observe) -> None:
 
 
 def test_blur_shows_the_curve_at_constant_exposure(tmp_path: Path) -> None:
-    """Blurred against sharp frames gives a gamma that brightness alone cannot, and none under the true profile."""
+    """Comparing blurred and sharp frames determines a gamma, unlike brightness alone; the true profile needs none."""
     folder = tmp_path / "capture"
     simulate_command(
         folder, width=400, height=320, focal_px=420, frames=30, exposure_ms=10, rate_rad_s=1.2, seed=53,
@@ -443,11 +446,11 @@ def test_blur_shows_the_curve_at_constant_exposure(tmp_path: Path) -> None:
     assert hidden_gamma.p_value < 1e-3 < nothing.p_value
 
 
-# ── values under the curve as found ────────────────────────────────────────────────────────────────────────────────
+# ── values with the estimated curve ────────────────────────────────────────────────────────────────────────────────
 
 
 def lit(observed: PhotometricObservations, nominal: CameraProfile, effect: PhotometricEffect) -> PictureVerdict:
-    """The ladder's verdict where this one effect was named."""
+    """The ladder's verdict that names this one effect."""
     fit = fit_photometry(observed, nominal, [effect])
     std = np.sqrt(np.diag(fit.of(effect.name)[1]))
     changes = changes_of(values_of(effect, nominal), values_of(effect, fit.profile), std)
@@ -459,7 +462,7 @@ def lit(observed: PhotometricObservations, nominal: CameraProfile, effect: Photo
 def settled(
     observed: PhotometricObservations, evidence: MixingEvidence | None, given: CameraProfile = NOMINAL
 ) -> tuple[PictureVerdict, PictureVerdict, CameraProfile]:
-    """(ladder's verdict, the same settled, profile) on patches and on what blur mixed."""
+    """(ladder's verdict, the same settled, profile) for patches and mixing by blur."""
     light = lit(observed, given, VIGNETTING)
     curve = PictureVerdict(light.profile)
     if evidence is not None:
@@ -468,13 +471,16 @@ def settled(
 
 
 def loss_of(verdict: PictureVerdict) -> tuple[float, float]:
-    """Corner loss that was named, and its deviation."""
+    """The named corner loss and its deviation."""
     change = next(f for f in verdict.findings if f.name == "vignetting").parameters["corner_loss"]
     return change.estimate, change.std
 
 
-def test_vignetting_is_that_under_the_curve_that_blur_shows(rng: np.random.Generator) -> None:
-    """A corner that a gamma darkens once more keeps its own light once the gamma is known, as well as that is known."""
+def test_vignetting_uses_the_curve_determined_by_blur(rng: np.random.Generator) -> None:
+    """A gamma darkens corners further.
+
+    With the estimated gamma, the loss is right and its deviation includes that of gamma.
+    """
     observed = made_observations(hidden(1.3, vignetting_corner_loss=0.5), rng)
     light, final, profile = settled(observed, mixing_evidence(rng, 1.5, 1.3, 0.02))
     assert profile.response is not None
@@ -485,7 +491,7 @@ def test_vignetting_is_that_under_the_curve_that_blur_shows(rng: np.random.Gener
     assert loss == pytest.approx(0.5, abs=2 * std)
     assert profile.extensions.vignetting_corner_loss == loss
     assert f"{loss:.3g}" in next(f.sentence for f in final.findings if f.name == "vignetting")
-    # (1 − loss)^gamma is what the patches tell
+    # patches determine (1 − loss)^gamma
     mixed = PictureVerdict(NOMINAL)
     name_curve(mixed, mixing_evidence(np.random.default_rng(1), 1.5, 1.3, 0.02))
     gamma_std = mixed.findings[0].parameters["gamma"].std
@@ -493,12 +499,12 @@ def test_vignetting_is_that_under_the_curve_that_blur_shows(rng: np.random.Gener
 
 
 @pytest.mark.parametrize(("strength", "true"), [(None, 1.25), (0.12, 0.8), (None, 1.0)])
-def test_a_curve_that_was_not_told_widens_what_hangs_on_it(
+def test_an_unknown_curve_widens_the_deviation_of_vignetting(
     rng: np.random.Generator, strength: float | None, true: float
 ) -> None:
-    """Without blur, or with blur that says little, the loss holds for the profile's curve, and its deviation for more.
+    """Without sufficient blur, the loss holds for the profile's curve with a larger deviation.
 
-    Whether there is vignetting does not hang on the curve.  A curve that the profile knows well leaves it as it was.
+    The significance of vignetting does not depend on the curve. A well-known curve does not change the result.
     """
     observed = made_observations(hidden(true, vignetting_corner_loss=0.5), rng)
     evidence = None if strength is None else mixing_evidence(rng, strength, true, 0.02)
@@ -515,8 +521,11 @@ def test_a_curve_that_was_not_told_widens_what_hangs_on_it(
     assert sure == pytest.approx((taken, narrow), rel=0.05)
 
 
-def test_a_lamp_pulses_as_the_exposure_found_says(rng: np.random.Generator) -> None:
-    """What a longer exposure averages away of a pulse comes back with that exposure, its deviation counted in."""
+def test_flicker_uses_the_estimated_exposure(rng: np.random.Generator) -> None:
+    """A longer exposure averages out more flicker.
+
+    The amplitude is corrected, and its deviation includes that of the exposure.
+    """
     true = hidden(flicker_amplitude=0.2, flicker_frequency_hz=100.0, flicker_phase_rad=1.0)
     short = replace(NOMINAL, shutter=replace(NOMINAL.shutter, exposure_scale=0.8))
     short = short.with_estimate("gamma", 1.0, 0.001, "calibrated")
@@ -528,13 +537,13 @@ def test_a_lamp_pulses_as_the_exposure_found_says(rng: np.random.Generator) -> N
     amplitude = final.findings[0].parameters["amplitude"]
     assert light.profile.extensions.flicker_amplitude < 0.17
     assert amplitude.estimate == profile.extensions.flicker_amplitude == pytest.approx(0.2, abs=0.01)
-    # 0.7 of a period are averaged: d log sinc(0.7 s) / d log s = x cot x − 1 with x = 0.7 π
+    # averaging over 0.7 of a period: d log sinc(0.7 s) / d log s = x cot x − 1 with x = 0.7 π
     x = 0.7 * np.pi
     assert amplitude.std == pytest.approx(0.2 * 0.05 * (1 - x / np.tan(x)), rel=0.15)
 
 
-def test_a_small_gamma_that_was_not_named_is_not_excluded(rng: np.random.Generator) -> None:
-    """Where exposures change, brightness itself says how far the curve may be off, and what that does to the rest."""
+def test_an_insignificant_gamma_widens_the_deviation(rng: np.random.Generator) -> None:
+    """With changing exposures, brightness limits the error of the curve and its effect on other parameters."""
     observed = made_observations(hidden(1.05, vignetting_corner_loss=0.5), rng, 0.25)
     light = lit(observed, NOMINAL, VIGNETTING)
     final, profile = settle_light(light, PictureVerdict(light.profile), NOMINAL, [])
@@ -550,12 +559,12 @@ def test_a_small_gamma_that_was_not_named_is_not_excluded(rng: np.random.Generat
 def followed_late(
     observed: PhotometricObservations, rng: np.random.Generator, most: float = 0.7
 ) -> PhotometricObservations:
-    """The same as an encoder passes it on: each patch keeps a part of its last picture, some much and some nothing."""
+    """The same patches after an encoder: each keeps a random part of its previous frame."""
     return kept_in_part(observed, rng.uniform(0.0, most, int(observed.patch.max()) + 1)[observed.patch])
 
 
 def kept_in_part(observed: PhotometricObservations, keeps: NDArray[np.float64]) -> PhotometricObservations:
-    """The same where each observation's patch keeps a part (n,) of its last picture."""
+    """The same with the part of the previous frame given for each observation (n,)."""
     grey = observed.grey.copy()
     for k in range(1, FRAMES):
         now, before = observed.frame == k, observed.frame == k - 1
@@ -564,13 +573,13 @@ def kept_in_part(observed: PhotometricObservations, keeps: NDArray[np.float64]) 
 
 
 def p_of_gains(observed: PhotometricObservations) -> float:
-    """Of frames having no gain of their own."""
+    """p-value for no gain drift."""
     fit = fit_photometry(observed, NOMINAL, [GainDrift(tuple(range(FRAMES)), FRAMES)])
     return significance(fit, "gain_drift", observed, NOMINAL)[1]
 
 
-def test_an_exposure_that_an_encoder_follows_late_is_no_gain(rng: np.random.Generator) -> None:
-    """Free gains take up what one memory for all patches leaves of an exposure's walk; true gains are still seen."""
+def test_an_exposure_change_with_encoder_lag_is_not_a_gain(rng: np.random.Generator) -> None:
+    """Free gains absorb what one memory for all patches leaves of an exposure change; true gains are still found."""
     assert p_of_gains(followed_late(made_observations(hidden(), rng, 1.0, 0.1), rng)) > 1e-4
     walk = np.exp(0.08 * np.sin(0.35 * np.arange(FRAMES) + 1))
     drifting = made_observations(hidden(gain=tuple(walk / np.median(walk))), rng, 1.0, 0.1)
@@ -578,7 +587,7 @@ def test_an_exposure_that_an_encoder_follows_late_is_no_gain(rng: np.random.Gene
 
 
 def test_a_jitter_of_three_percent_shows_between_neighbouring_frames(rng: np.random.Generator) -> None:
-    """While the exposure walks, what frames share hides a small gain; from frame to frame it does not."""
+    """While the exposure changes, the shared error of frames hides a small gain, but not from frame to frame."""
     jitter = np.exp(0.03 * rng.normal(size=FRAMES))
     true = hidden(gain=tuple(jitter / np.median(jitter)))
     shaken, steady = (
@@ -589,7 +598,10 @@ def test_a_jitter_of_three_percent_shows_between_neighbouring_frames(rng: np.ran
 
 
 def test_gains_of_frames_without_a_common_patch_cannot_be_compared(rng: np.random.Generator) -> None:
-    """Half the patches are seen early, the others late: how the halves compare is open, within each gains are known."""
+    """Half of the patches are seen early, the others late.
+
+    The ratio of the halves is undetermined, gains within each are known.
+    """
     observed = made_observations(hidden(), rng)
     early = observed.frame < FRAMES // 2
     parted = observed.subset(early == (observed.place < 75))
@@ -602,8 +614,8 @@ def test_gains_of_frames_without_a_common_patch_cannot_be_compared(rng: np.rando
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_starved_encoder_that_keeps_the_dark_is_no_cause(seed: int) -> None:
-    """Dark patches that hardly change with the exposure, in a movie that keeps most of all: nothing is named."""
+def test_a_low_bit_rate_that_keeps_dark_patches_is_not_a_cause(seed: int) -> None:
+    """Dark patches hardly follow the exposure in a movie that mostly repeats frames: no cause is named."""
     rng = np.random.default_rng(seed)
     made = made_observations(hidden(), rng, 0.8, 0.2)
     verdict = PictureVerdict(NOMINAL)
@@ -612,7 +624,7 @@ def test_a_starved_encoder_that_keeps_the_dark_is_no_cause(seed: int) -> None:
 
 
 def test_a_black_level_beside_an_encoder_s_memory_is_named(rng: np.random.Generator) -> None:
-    """An encoder that keeps a fifth of each picture hides no black level."""
+    """An encoder that keeps a fifth of each frame does not hide a black level."""
     made = made_observations(hidden(black=0.04), rng, 0.8, 0.2)
     verdict = PictureVerdict(NOMINAL)
     climb_observations(verdict, kept_in_part(made, np.full(len(made), 0.2)), FRAMES)

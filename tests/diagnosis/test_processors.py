@@ -1,4 +1,4 @@
-"""What a diagnosis says does not hang on how a processor rounds."""
+"""A diagnosis does not depend on a processor's rounding."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from virest.diagnosis.geometric_verdict import Accepted
 
 TESTS = Path(__file__).resolve().parent.parent
 CORES = ("Haswell", "Nehalem")
-"""Kinds of processor whose sums OpenBLAS orders differently; it runs either on any x86-64 with AVX2."""
+"""Processor types whose sums OpenBLAS orders differently; both run on any x86-64 with AVX2."""
 HAND = Setup(seed=61, frames=37, points=15, readout_direction="top_to_bottom", gyro_noise_rad_s=0.001)
 CLIMB = """
 import json
@@ -46,8 +46,8 @@ print(json.dumps({f.name: {k: [c.estimate, c.std] for k, c in f.parameters.items
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="core types of x86 processors")
-def test_two_kinds_of_processor_say_the_same() -> None:
-    """The same causes, and values that differ by far less than their deviations."""
+def test_two_processor_types_give_the_same_diagnosis() -> None:
+    """The causes are the same, and values differ by far less than their deviations."""
     told = []
     for core in CORES:
         env = {**os.environ, "OPENBLAS_CORETYPE": core, "OPENCV_IPP": "disabled"}
@@ -60,7 +60,7 @@ def test_two_kinds_of_processor_say_the_same() -> None:
 
 
 def ends(monkeypatch: pytest.MonkeyPatch, losses: tuple[np.ndarray, np.ndarray]) -> tuple[Evidence, list]:
-    """Two ends of a ladder, with causes of their own, whose held-out losses by block are given."""
+    """Two final states of a ladder with different causes and given held-out losses by time block."""
     camera = Recording(HAND)
     evidence = make_evidence(camera.imu, camera.observed)
     model = Model(camera.profile, None, ())
@@ -79,8 +79,10 @@ WOBBLE = np.array([0.03, -0.02, 0.01, -0.03, 0.02, -0.01])
 
 
 @pytest.mark.parametrize("swapped", [False, True])
-def test_ends_that_held_out_points_do_not_tell_apart_are_rivals(swapped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which end is told does not depend on which was reached first; the other's cause is named beside it."""
+def test_ladder_ends_that_held_out_points_cannot_separate_are_rivals(
+    swapped: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reported end does not depend on the order; the cause of the other is named as a rival."""
     evidence, (one, other) = ends(monkeypatch, (0.5 + WOBBLE, 0.5 - WOBBLE))
     first, second = (other, one) if swapped else (one, other)
     found = _better_end(evidence, first, second)
@@ -91,10 +93,8 @@ def test_ends_that_held_out_points_do_not_tell_apart_are_rivals(swapped: bool, m
 
 
 @pytest.mark.parametrize("swapped", [False, True])
-def test_of_two_rivals_the_one_that_held_out_points_are_better_off_with_is_told(
-    swapped: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By one standard error: too little to tell them apart, enough to say which is told first, whichever came first."""
+def test_the_rival_with_the_smaller_held_out_loss_is_reported(swapped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One standard error cannot separate the rivals but determines the reported one, whatever the order."""
     good, bad = 0.5 + WOBBLE, 0.504 + 1.3 * WOBBLE
     evidence, (one, other) = ends(monkeypatch, (bad, good) if swapped else (good, bad))
     first, second = (other, one) if swapped else (one, other)
@@ -103,15 +103,15 @@ def test_of_two_rivals_the_one_that_held_out_points_are_better_off_with_is_told(
     assert [rival.name for rival in found.accepted[1].rivals] == ["principal_point"]
 
 
-def test_the_better_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where every block prefers one end there is no rival."""
+def test_a_clearly_better_ladder_end_has_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every time block prefers the same end."""
     evidence, (one, other) = ends(monkeypatch, (0.5 + 0.1 * WOBBLE, 0.7 - 0.1 * WOBBLE))
     assert _better_end(evidence, one, other) is one
     assert one.rival is None
 
 
-def test_deviations_hold_what_two_ends_differ_by() -> None:
-    """0.0041 and 0.0052 are equally likely: half the squared difference is in the variance."""
+def test_deviations_include_the_difference_of_two_ends() -> None:
+    """Two equally likely estimates add half of their squared difference to the variance."""
     change = _widened(ParameterChange(0.0, 0.0041, 2e-4), ParameterChange(0.0, 0.00515, 2e-4))
     assert change.std == pytest.approx(np.hypot(2e-4, 0.00105 / np.sqrt(2)))
     word = ParameterChange("exposure_start", "exposure_end", None)

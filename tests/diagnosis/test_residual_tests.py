@@ -1,4 +1,4 @@
-"""What is left of the points: the scene's relief and a sensor's last hundredths are no fault of the model."""
+"""Residuals of points: relief of the scene and small sensor noise are not faults of the model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WALL = Setup(
 
 @pytest.fixture(scope="module")
 def before_a_wall() -> GeometricVerdict:
-    """The true profile's verdict where a camera walks towards a wall."""
+    """The true profile's verdict for a camera that walks towards a wall."""
     recording = Recording(WALL)
     imu = recording.imu.between(-0.2, recording.stamp_s[-1] + 0.25)
     profile = replace(recording.profile, depth_m=None)
@@ -31,7 +31,7 @@ def before_a_wall() -> GeometricVerdict:
 
 
 def shifted(verdict: GeometricVerdict, *, across: bool) -> GeometricVerdict:
-    """Points of the picture's upper part off by a nearer scene, or by as much across its parallax."""
+    """Points of the upper part of the frame shifted along their parallax, as by a nearer scene, or across it."""
     along = verdict.fit.along_px
     assert along is not None
     off = 0.15 * along * (verdict.table.second_px[:, 1:] < 250)
@@ -41,8 +41,8 @@ def shifted(verdict: GeometricVerdict, *, across: bool) -> GeometricVerdict:
     return replace(verdict, fit=fit)
 
 
-def test_what_stands_before_the_plane_is_no_structure(before_a_wall: GeometricVerdict) -> None:
-    """A ceiling nearer than the wall shifts rows along their parallax; a fault of the same size crosses it."""
+def test_relief_is_not_residual_structure(before_a_wall: GeometricVerdict) -> None:
+    """A ceiling nearer than the wall shifts points along their parallax; a fault shifts them across it."""
     assert not points_left(before_a_wall).significant
     assert not points_left(shifted(before_a_wall, across=False)).significant
     found = points_left(shifted(before_a_wall, across=True))
@@ -50,8 +50,8 @@ def test_what_stands_before_the_plane_is_no_structure(before_a_wall: GeometricVe
     assert found.size > 0.05
 
 
-def test_some_hundredths_of_a_pixel_are_no_cause(before_a_wall: GeometricVerdict) -> None:
-    """A gyroscope's noise over sharp tracks is a large part of nearly nothing; the same part of more is a fault."""
+def test_a_very_small_residual_is_not_a_fault(before_a_wall: GeometricVerdict) -> None:
+    """Gyroscope noise may be a large part of a very small residual; the same part of a larger one is a fault."""
     calm = replace(before_a_wall, noise_px=0.027, final_rms_px=0.035)
     assert not points_left(calm).significant
     noisier = replace(before_a_wall.fit, distance=1.7 * before_a_wall.fit.distance)
@@ -61,14 +61,14 @@ def test_some_hundredths_of_a_pixel_are_no_cause(before_a_wall: GeometricVerdict
     assert found.p_value < 1e-4
 
 
-def test_what_may_be_chance_is_no_fault(before_a_wall: GeometricVerdict) -> None:
-    """A residual above the noise that pairs of frames do not bear out is not called unexplained."""
+def test_an_inconsistent_residual_is_not_a_fault(before_a_wall: GeometricVerdict) -> None:
+    """A residual above the noise that the pairs of frames do not confirm is not reported."""
     found = points_left(replace(before_a_wall, noise_px=0.08, final_rms_px=0.13))
     assert not found.significant
 
 
-def test_what_differently_blurred_frames_do_to_the_tracker_is_no_fault() -> None:
-    """Points of a pair are off together, as both frames' blur paths predict; as much the other way is a fault."""
+def test_tracking_bias_from_blur_is_not_a_fault() -> None:
+    """Points shift together as the blur paths of both frames predict; the opposite shift is a fault."""
     recording = Recording(replace(WALL, velocity_m_s=(0.0, 0.0, 0.0), rate_rad_s=1.2, noise_px=0.1))
     imu = recording.imu.between(-0.2, recording.stamp_s[-1] + 0.25)
     evidence = make_evidence(imu, recording.observed)
@@ -89,13 +89,13 @@ def test_what_differently_blurred_frames_do_to_the_tracker_is_no_fault() -> None
 
 
 def exposed_for(verdict: GeometricVerdict, exposure_s: float) -> GeometricVerdict:
-    """The same points, exposed for so long."""
+    """The same points with another exposure."""
     table = verdict.table
     return replace(verdict, table=replace(table, second_exposure_s=np.full(len(table), exposure_s)))
 
 
-def test_travel_blurs_by_what_it_moves_points_within_an_exposure(before_a_wall: GeometricVerdict) -> None:
-    """Walking on at 0.8 m/s before a wall 1.6 m away blurs a long exposure, a short one hardly; turning not."""
+def test_translation_blur_is_the_motion_within_an_exposure(before_a_wall: GeometricVerdict) -> None:
+    """Walking at 0.8 m/s towards a wall at 1.6 m blurs a long exposure, hardly a short one; rotation does not."""
     short, long = (travel_blur_px(exposed_for(before_a_wall, exposure_s)) for exposure_s in (0.0005, 0.01))
     assert long == pytest.approx(20 * short, rel=0.2)
     assert short < MOST_TRAVEL_PX < long

@@ -1,4 +1,4 @@
-"""What a better model does for restored pictures, without truth."""
+"""Benefit of a better model for restored frames, without ground truth."""
 
 import dataclasses
 from itertools import pairwise
@@ -27,7 +27,7 @@ WHOLE = (0, 0, 320, 240)
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
-    """Captures of a readout that is too long in the profile, and of a defocus that it does not know."""
+    """Captures with a readout time too long in the profile, and with an unknown defocus."""
 
     def read(name, effect):
         folder: Path = tmp_path_factory.mktemp("gain") / name
@@ -40,7 +40,7 @@ def simulated(tmp_path_factory):
 
 
 def readers(capture):
-    """Colour and luma of the frames asked for."""
+    """Functions that read colour and luma of the requested frames."""
     index = probe_movie(capture.movie)
     colour = lambda numbers: (p for n in numbers for p in read_frames(capture.movie, index, n, n))  # noqa: E731
     return colour, lambda numbers: read_gray(capture.movie, index, numbers)
@@ -54,13 +54,13 @@ def textured(rng, sigma=1.2):
 
 
 def shared(first, second):
-    """Shared gradient energy of two whole pictures."""
+    """Shared gradient energy of two complete pictures."""
     tracks = track_pairs([(4, first[..., 0].copy()), (5, second[..., 0].copy())])[0]
     return shared_gradient((first, second), (WHOLE, WHOLE), tracks)
 
 
-def test_noise_is_no_sharpness(rng):
-    """Noise of its own in each picture raises the plain gradient energy by a fifth and more, the shared one never."""
+def test_noise_does_not_count_as_sharpness(rng):
+    """Independent noise raises the plain gradient energy by more than 20 % but never the shared one."""
     clean = textured(rng, 4.0)
     pair = clean, np.roll(clean, (1, 2), (0, 1))
     noise = [rng.normal(0, 10, (240, 320, 1)) for _ in pair]
@@ -70,16 +70,16 @@ def test_noise_is_no_sharpness(rng):
     assert 0.5 * shared(*pair) < shared(*noisy) < shared(*pair)
 
 
-def test_blur_lowers_what_is_shared(rng):
-    """A Gaussian of 1.5 px on both pictures costs more than half of it."""
+def test_blur_lowers_the_shared_gradient_energy(rng):
+    """A Gaussian of 1.5 px on both pictures removes more than half of it."""
     sharp = textured(rng)
     moved = np.roll(sharp, (3, -2), (0, 1))
     soft = [cv2.GaussianBlur(picture, (0, 0), 1.5) for picture in (sharp, moved)]
     assert shared(*soft) < 0.5 * shared(sharp, moved)
 
 
-def test_pictures_that_cannot_be_laid_on_each_other_share_nothing_known(rng):
-    """Without tracks or without a common area the answer is NaN."""
+def test_shared_gradient_energy_is_nan_without_alignment(rng):
+    """Without tracks or a common area the result is NaN."""
     picture = textured(rng)
     assert np.isnan(shared_gradient((picture, picture), (WHOLE, WHOLE), None))
     tracks = track_pairs([(4, picture[..., 0].copy()), (5, np.roll(picture[..., 0], 1, 1).copy())])[0]
@@ -87,7 +87,7 @@ def test_pictures_that_cannot_be_laid_on_each_other_share_nothing_known(rng):
 
 
 def test_pairs_do_not_overlap_and_have_both_frames(simulated):
-    """Each frame belongs to one pair, repeats to none, and a known start-up gives a pair."""
+    """Each frame belongs to at most one pair, and a repeated frame belongs to none."""
     capture, profile, _ = simulated["readout"]
     firsts = chosen_pairs(capture, profile)
     assert len(firsts) >= 3
@@ -98,7 +98,7 @@ def test_pairs_do_not_overlap_and_have_both_frames(simulated):
 
 
 def test_the_right_readout_makes_neighbours_agree(simulated):
-    """The model's own places of points in the next picture come to tracking's noise; it does so for no other reason."""
+    """With the right readout time, the predicted positions of points in the next frame are accurate."""
     capture, nominal, true = simulated["readout"]
     gain = measure_restoration_gain(capture, nominal, true, *readers(capture))
     assert gain.disagreement_before_px > 0.6
@@ -107,8 +107,11 @@ def test_the_right_readout_makes_neighbours_agree(simulated):
     assert len(gain.frames) == len(set(gain.frames)) >= 6
 
 
-def test_the_right_blur_makes_pictures_sharper(simulated):
-    """Undoing the defocus too shows more than undoing the motion alone, and that more than the recorded pictures."""
+def test_the_right_blur_makes_frames_sharper(simulated):
+    """Removing the defocus too gives more sharpness than removing only motion blur.
+
+    Both are sharper than the recorded frames.
+    """
     capture, nominal, true = simulated["defocus"]
     gain = measure_restoration_gain(capture, nominal, true, *readers(capture))
     assert gain.sharpness_before > gain.sharpness_recorded
@@ -117,8 +120,8 @@ def test_the_right_blur_makes_pictures_sharper(simulated):
     assert (same.sharpness_before, same.disagreement_before_px) == (same.sharpness_after, same.disagreement_after_px)
 
 
-def test_pairs_are_kept_back_where_there_are_frames_to_spare(simulated):
-    """A tenth of the frames at most; a capture of 14 frames spares none."""
+def test_pairs_are_kept_back_only_from_long_captures(simulated):
+    """At most a tenth of the frames is kept back; a capture of 14 frames has none to spare."""
     capture, profile, _ = simulated["readout"]
     assert pairs_to_keep_back(capture, profile) == []
     frames = [dataclasses.replace(frame, skip_reason=None, skip_codes=()) for frame in capture.frames]
@@ -127,8 +130,8 @@ def test_pairs_are_kept_back_where_there_are_frames_to_spare(simulated):
     assert len(firsts) == 1
 
 
-def test_no_fit_sees_the_frames_that_are_kept_back(tmp_path):
-    """Whatever those frames show, points and blur say the same; restored, they tell what the causes are worth."""
+def test_no_fit_uses_the_frames_kept_back(tmp_path):
+    """Points and blur give the same results whatever these frames show."""
     folder = tmp_path / "kept"
     simulate_command(folder, width=240, height=320, frames=22, seed=3, rate_rad_s=1.0, exposure_ms=9)
     source = open_source(folder)

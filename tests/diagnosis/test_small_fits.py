@@ -1,4 +1,4 @@
-"""The small fits inside the searches: sines of unequal weights, growth beside a shift, what was not found."""
+"""Small fits within the searches: sines with unequal weights, growth beside a shift, missing causes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from virest.diagnosis.photometry_effects import _sines
 from virest.diagnosis.refit_photometry import _exposure_variance
 
 
-def test_a_sine_under_unequal_weights_is_found_with_its_phase(rng: np.random.Generator) -> None:
-    """Patches of levels of their own that are seen at few, crowded instants: sine and cosine are not orthogonal."""
+def test_a_sine_with_unequal_weights_is_found_with_its_phase(rng: np.random.Generator) -> None:
+    """Patches have individual levels and few, crowded instants, so sine and cosine are not orthogonal."""
     patch = np.repeat(np.arange(40), 12)
     time_s = rng.uniform(0, 0.013, patch.size)
     stiffness = rng.uniform(0.1, 10.0, patch.size)
@@ -25,14 +25,14 @@ def test_a_sine_under_unequal_weights_is_found_with_its_phase(rng: np.random.Gen
 
 
 @pytest.mark.parametrize("growth", [0.02, -0.01])
-def test_growth_is_told_from_a_shift_and_from_points_that_went_astray(rng: np.random.Generator, growth: float) -> None:
-    """A tenth of the points went elsewhere."""
+def test_growth_is_separated_from_a_shift_and_outliers(rng: np.random.Generator, growth: float) -> None:
+    """A tenth of the points are outliers."""
     arm = rng.uniform(-300, 300, (200, 2))
     off = growth * arm + (3.0, -2.0) + rng.normal(0, 0.1, arm.shape)
     off[:20] += rng.normal(0, 30, (20, 2))
     assert _growth(arm, off) == pytest.approx(growth, abs=2e-4)
 
 
-def test_an_exposure_that_was_not_found_adds_nothing() -> None:
-    """No cause, no variance."""
+def test_without_an_exposure_cause_there_is_no_exposure_variance() -> None:
+    """An empty list of findings adds no variance."""
     assert _exposure_variance([]) == 0.0

@@ -1,4 +1,4 @@
-"""Probabilities and deviations are computed or unknown, and sums are such as can be."""
+"""Probabilities and deviations are computed or unknown, and residuals and noise are consistent."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def evidence_of(setup: Setup) -> tuple[Recording, Evidence]:
     return camera, make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), camera.observed)
 
 
-def test_a_word_is_as_probable_as_its_gain_by_blocks() -> None:
-    """A readout of the wrong sense has a probability that follows from the blocks, not a constant."""
+def test_the_p_value_of_a_word_follows_from_its_gain_by_blocks() -> None:
+    """The p-value of a readout direction is computed from the time blocks and is not a constant."""
     camera, evidence = evidence_of(HAND)
     shutter = replace(camera.profile.shutter, readout_direction="bottom_to_top")
     verdict = climb(evidence, replace(camera.profile, shutter=shutter), (), ())
@@ -45,8 +45,8 @@ def test_a_word_is_as_probable_as_its_gain_by_blocks() -> None:
     assert chance_of(np.array([0.1, 0.12, 0.11, 0.09])) < 1e-3 < chance_of(np.array([0.1, -0.12, 0.31, 0.09]))
 
 
-def test_two_pairs_prove_no_noise_beyond_tracking_s() -> None:
-    """Probabilities are numbers, however few pairs there are and however alike."""
+def test_few_pairs_do_not_prove_noise_beyond_tracking() -> None:
+    """p-values are defined for any number of pairs and for equal residuals."""
     for pairs in (0, 1, 2, 5):
         pair = np.repeat(np.arange(pairs), 20)
         noisier, stray = _more_than_noise(np.full(len(pair), 1.5), pair, 1.0)
@@ -54,8 +54,8 @@ def test_two_pairs_prove_no_noise_beyond_tracking_s() -> None:
         assert stray == (0.5 if pairs < 3 else 1.0)
 
 
-def test_a_lag_is_as_well_known_as_its_pairs_tell_it() -> None:
-    """The deviation of a lag shrinks with tracking noise, and holds what lies between two steps of the schedule."""
+def test_the_deviation_of_a_lag_follows_from_its_pairs() -> None:
+    """It shrinks with the tracking noise and includes the steps of the schedule."""
     found = []
     for noise_px in (0.05, 0.4):
         camera, evidence = evidence_of(replace(HAND, noise_px=noise_px))
@@ -68,15 +68,15 @@ def test_a_lag_is_as_well_known_as_its_pairs_tell_it() -> None:
 
 
 def test_a_gain_without_noise_is_a_lower_bound() -> None:
-    """Unknown noise takes nothing away from before; noise above before leaves nothing of which to take a part."""
+    """Unknown noise is not subtracted; if the noise exceeds the residual before, the gain is undefined."""
     assert HeldOutGain(GEOMETRY, 2.0, 1.0, None).gain == pytest.approx(0.75)
     assert HeldOutGain(GEOMETRY, 2.0, 1.0, 1.0).gain == pytest.approx(1.0)
     assert HeldOutGain(GEOMETRY, 2.0, 1.0, 2.5).gain is None
 
 
 @pytest.mark.parametrize("inertial", [True, False])
-def test_noise_stands_beside_the_residual_that_it_is_part_of(inertial: bool) -> None:
-    """Where depths vary, both leave the parallax out: the noise is then about what was put in, and no more."""
+def test_noise_and_residual_are_consistent(inertial: bool) -> None:
+    """With varying depths both exclude the parallax, so the noise is about the true one."""
     camera = Recording(ROOM)
     evidence = make_evidence(camera.imu, camera.observed)
     model = Model(camera.profile, None, ())
@@ -89,8 +89,8 @@ def test_noise_stands_beside_the_residual_that_it_is_part_of(inertial: bool) -> 
     assert 0.5 * ROOM.noise_px < noise < 1.6 * ROOM.noise_px
 
 
-def test_sums_can_be() -> None:
-    """A residual below the noise is said to be no more than it."""
+def test_residual_texts_are_plausible() -> None:
+    """A residual below the noise is described as no more than the noise."""
     assert residual_words(0.399, 0.123) == "0.399 px (tracking noise 0.123 px)"
     assert residual_words(0.05, 0.763) == "0.05 px, no more than tracking noise (0.763 px)"
     assert "p unknown" in remaining_words({"p_value": None, "strongest_along": "place"}, "unexplained")

@@ -1,4 +1,4 @@
-"""Structure in residuals: none in noise, found along what makes it, not found where scatter explains it."""
+"""Structure in residuals: none in noise, found along its covariate, and not confused with scatter."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FLOOR_PX = 0.02
 
 
 def cloud(seed: int) -> tuple[Array, Array, dict[str, Array], Array]:
-    """White residuals of 0.2 px with weights, covariates that have nothing to do with them, and pairs."""
+    """White residuals of 0.2 px with weights, unrelated covariates, and pairs."""
     rng = np.random.default_rng(seed)
     pair = np.repeat(np.arange(PAIRS), POINTS)
     covariates = {
@@ -25,12 +25,12 @@ def cloud(seed: int) -> tuple[Array, Array, dict[str, Array], Array]:
 
 
 def named(found: list[Structure]) -> dict[str, Structure]:
-    """By covariate."""
+    """Structures by covariate."""
     return {structure.along: structure for structure in found}
 
 
 def test_white_residuals_show_no_structure() -> None:
-    """Over 25 clouds: nothing near significance, sizes of some hundredths at most, p-values not crowded at nought."""
+    """Over 25 clouds nothing is significant, sizes stay at a few 0.01 px, and p-values do not cluster near 0."""
     rows, others = [], []
     for seed in range(25):
         values, weight, covariates, pair = cloud(seed)
@@ -46,20 +46,20 @@ def test_white_residuals_show_no_structure() -> None:
 
 
 def test_a_wave_along_rows_is_found_along_rows() -> None:
-    """A tenth of a pixel up and down the rows stands first, at its rms, and nowhere else."""
+    """A wave of 0.1 px over the rows is listed first with its RMS and is not found along other covariates."""
     values, weight, covariates, pair = cloud(31)
     values[:, 1] += 0.1 * np.sin(2 * np.pi * covariates["row"] / 640)
     found = structures(values, weight, covariates, pair, FLOOR_PX)
     assert found[0].along == "row"
     assert found[0].p_value < 1e-6
-    # the wave's rms over both coordinates, less what ten bins and the floor take
+    # the wave's RMS over both coordinates, reduced by the ten bins and the floor
     assert found[0].size == pytest.approx(0.1 / 2, rel=0.2)
     assert all(structure.p_value > 1e-3 for structure in found[1:])
     assert [s.size for s in found] == sorted((s.size for s in found), reverse=True)
 
 
-def test_a_single_column_of_residuals_will_do() -> None:
-    """Residuals (n, 1), as brightness gives, with a slope along the radius."""
+def test_residuals_may_have_one_column() -> None:
+    """Residuals (n, 1), as from brightness, with a slope along the radius."""
     values, weight, covariates, pair = cloud(32)
     one = values[:, :1] + 0.0006 * (covariates["radius"][:, None] - 190)
     found = structures(one, weight, covariates, pair, FLOOR_PX)
@@ -67,8 +67,8 @@ def test_a_single_column_of_residuals_will_do() -> None:
     assert found[0].p_value < 1e-6
 
 
-def test_what_differs_from_pair_to_pair_is_scatter() -> None:
-    """A shift of its own for each pair, far above the noise, is no structure along rows or radii."""
+def test_a_shift_of_each_pair_is_scatter() -> None:
+    """Individual shifts of pairs far above the noise are not structure along rows or radius."""
     values, weight, covariates, pair = cloud(33)
     values += np.random.default_rng(34).normal(0, 0.3, (PAIRS, 2))[pair]
     found = named(structures(values, weight, covariates, pair, FLOOR_PX))
@@ -77,7 +77,7 @@ def test_what_differs_from_pair_to_pair_is_scatter() -> None:
 
 
 def test_means_below_the_floor_are_not_counted() -> None:
-    """A wave of half the floor has no p-value to speak of; without a floor the same wave is significant."""
+    """A wave of half the floor is not significant; without a floor it is."""
     values, weight, covariates, pair = cloud(35)
     values = 0.1 * values
     values[:, 0] += 0.01 * np.sin(2 * np.pi * covariates["row"] / 320)
@@ -86,8 +86,8 @@ def test_means_below_the_floor_are_not_counted() -> None:
     assert named(structures(values, weight, covariates, pair, 0.0))["row"].p_value < 1e-6
 
 
-def test_points_without_weight_do_not_speak() -> None:
-    """Wild residuals of weight nought change nothing."""
+def test_points_without_weight_have_no_influence() -> None:
+    """Extreme residuals with weight 0 change nothing."""
     values, weight, covariates, pair = cloud(36)
     wild = covariates["row"] > 560
     weight[wild] = 0.0
@@ -96,8 +96,8 @@ def test_points_without_weight_do_not_speak() -> None:
     assert structures(values, weight, covariates, pair, FLOOR_PX) == calm
 
 
-def test_one_stretch_of_time_tells_no_scatter() -> None:
-    """With all points in one pair there is nothing to judge a mean by: no structure is claimed along rows."""
+def test_one_pair_gives_no_estimate_of_scatter() -> None:
+    """With all points in one pair, no structure is reported along rows."""
     values, weight, covariates, pair = cloud(37)
     values[:, 1] += 0.5 * np.sin(covariates["row"] / 100)
     found = named(structures(values, weight, {"row": covariates["row"]}, 0 * pair, FLOOR_PX))

@@ -1,4 +1,4 @@
-"""Many candidates: all begin, few go on, and the right one is among them."""
+"""Many candidates start, few are fitted to the end, and the right one is among them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ EVIDENCE = make_evidence(CAMERA.imu.between(-0.2, CAMERA.stamp_s[-1] + 0.25), CA
 
 
 def test_the_right_cause_wins_a_race_as_it_wins_a_screening() -> None:
-    """Of all causes at all starts few are fitted to the end; the hidden one comes out first, as well fitted."""
+    """Few of all causes and starts are fitted completely.
+
+    The hidden one ranks first with the same loss as in a full fit.
+    """
     wrong = Model(replace(CAMERA.profile, time_offset_s=0.025), None, ())
     candidates = candidates_of(EVIDENCE, wrong.profile, wrong, set(), (), FarStart())
     iterations: list[int] = []
@@ -48,8 +51,8 @@ def test_the_right_cause_wins_a_race_as_it_wins_a_screening() -> None:
     np.testing.assert_allclose(raced[0].losses, screened[0].losses, rtol=0.01)
 
 
-def test_a_rival_way_takes_causes_of_the_first_alone() -> None:
-    """What may enter on the way that is climbed for comparison is what entered on the other."""
+def test_a_rival_search_uses_only_the_causes_of_the_first() -> None:
+    """The comparison search may only include causes that entered the first search."""
     model = Model(replace(CAMERA.profile, time_offset_s=0.025), None, ())
     course = SearchContext(EVIDENCE, model.profile, (), FarStart(), one_by_one)
     some = replace(course, among=frozenset({"gyro_bias", "focal_length"}))

@@ -1,4 +1,4 @@
-"""The table of effects: what depends on a profile follows from it, the documentation has it, the simulator names it."""
+"""The table of effects: derived values, documentation and simulator are consistent with it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SHADED = Field("gain", ("x", "y"), ((0.0, 400.0), (0.0, 600.0)), ((0.0,), (0.1,)
 
 
 def whole_profile() -> CameraProfile:
-    """A profile in which everything is on, so that whatever changes shows."""
+    """A profile with every effect switched on, so that any change shows."""
     profile = recorded(SWAYING).profile
     extensions = replace(
         profile.extensions, gyro_lowpass_hz=20.0, focal_drift_per_s=0.01, flicker_amplitude=0.3, field=(LOGGED, DRIVEN)
@@ -42,7 +42,7 @@ def whole_profile() -> CameraProfile:
 
 
 def of_lens(profile: CameraProfile) -> Any:
-    """A lens with another place of everything."""
+    """A lens with other values."""
     assert profile.intrinsics is not None
     lens = replace(profile.intrinsics, model="radtan", coefficients=(0.03, 0.0, 0.0, 0.0, 0.0))
     return replace(lens, cx_px=lens.cx_px + 3, fx_px=lens.fx_px * 1.02)
@@ -91,7 +91,7 @@ OTHER_EXTENSION: dict[str, Any] = {
 
 
 def changed_profiles() -> dict[str, CameraProfile]:
-    """Each value changed alone, and each effect by a step of its own."""
+    """Profiles with a single changed value or a step of a single effect."""
     profile = whole_profile()
     found = {name: replace(profile, **{name: change(profile)}) for name, change in OTHER.items()}
     for name, value in OTHER_EXTENSION.items():
@@ -110,21 +110,21 @@ def changed_profiles() -> dict[str, CameraProfile]:
 
 
 def seen_px(known: IntegratedMotion, travels: bool) -> np.ndarray:
-    """Where the points should be."""
+    """Predicted positions of the points."""
     recording = recorded(SWAYING)
     table = recording.table()
     return predict(known, table, recording.scene(table) if travels else None).second_px
 
 
-def test_every_value_of_a_profile_has_been_thought_of() -> None:
-    """A new one must be changed here too."""
+def test_every_value_of_a_profile_is_changed_in_these_tests() -> None:
+    """A new value must be added here too."""
     assert set(OTHER) == {entry.name for entry in fields(CameraProfile)} - {"extensions"}
     assert set(OTHER_EXTENSION) == {entry.name for entry in fields(Extensions)}
 
 
 @pytest.mark.parametrize("name", changed_profiles())
-def test_a_changed_value_changes_predictions_as_a_fresh_integration_does(name: str) -> None:
-    """What is kept of an earlier profile's integration is never stale."""
+def test_a_changed_value_gives_the_predictions_of_a_new_integration(name: str) -> None:
+    """Cached parts of an earlier profile's integration are never stale."""
     imu, before, after = recorded(SWAYING).imu, whole_profile(), changed_profiles()[name]
     for travels in (True, False):
         known = integrate_motion(imu, before, translation=travels)
@@ -132,14 +132,14 @@ def test_a_changed_value_changes_predictions_as_a_fresh_integration_does(name: s
         np.testing.assert_allclose(seen_px(with_profile(known, imu, after), travels), fresh, atol=1e-9)
 
 
-def test_every_kind_of_field_has_been_thought_of() -> None:
-    """The lens holds displacements; a new kind must be changed here too."""
+def test_every_kind_of_field_is_changed_in_these_tests() -> None:
+    """Displacements belong to the lens; a new kind must be added here too."""
     known = {field.kind for field in (LOGGED, DRIVEN, FOUND, LATE, SHADED, SOFT)}
     assert known == KINDS.keys() - {"displacement"}
 
 
-def test_what_nobody_has_thought_of_is_integrated_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An extension without a line in the table costs time, and is not stale."""
+def test_an_extension_missing_from_the_table_is_integrated_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The result is slower but never stale."""
     profile = whole_profile()
     other = replace(profile, extensions=replace(profile.extensions, defocus_sigma_px=1.0))
     assert not touched(profile, other).rates
@@ -148,7 +148,7 @@ def test_what_nobody_has_thought_of_is_integrated_anew(monkeypatch: pytest.Monke
 
 
 def test_the_documentation_has_the_table() -> None:
-    """Each effect's row on the page of profiles has its parameters and its place in the file."""
+    """Each effect's row in the profile documentation has its parameters and its key in the file."""
     page = (DOCS / "profile.md").read_text(encoding="utf-8")
     rows = {row[0]: row[1:] for row in re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|$", page, re.MULTILINE)}
     for effect in EFFECTS.values():
@@ -157,8 +157,8 @@ def test_the_documentation_has_the_table() -> None:
         assert place == effect.place or not effect.place
 
 
-def test_the_simulator_has_a_line_for_every_effect_and_no_other() -> None:
-    """By the table's names; of a vector, a size for each part."""
+def test_the_simulator_has_exactly_the_effects_of_the_table() -> None:
+    """Each drawn effect has a size for every parameter."""
     assert simulated._BY_NAME.keys() == EFFECTS.keys()
     context = simulated.EffectContext(20, 30.0, np.random.default_rng(1))
     for name, effect in simulated.EFFECTS.items():
@@ -166,7 +166,7 @@ def test_the_simulator_has_a_line_for_every_effect_and_no_other() -> None:
 
 
 def test_every_sentence_can_be_filled_and_every_unit_is_known() -> None:
-    """A parameter's ending is a unit, or it is a ratio or a word."""
+    """A parameter's suffix is a unit, unless it is a ratio or a word."""
     plain = {"clock_skew", "readout_direction", "timestamp", "exposure_scale", "gyro_scale", "focal_scale", "k1",
              "pixel_aspect", "fraction", "frames", "gamma", "black_level", "corner_loss", "amplitude", "gain",
              "amount"}  # fmt: skip
@@ -179,7 +179,7 @@ def test_every_sentence_can_be_filled_and_every_unit_is_known() -> None:
 
 @pytest.mark.parametrize("name", [name for name, effect in EFFECTS.items() if effect.steps is not None])
 def test_values_follow_their_steps(name: str) -> None:
-    """Read after a step, each parameter has moved as its deviation says that it would, to first order."""
+    """After a step, each parameter has moved by its first-order spread."""
     effect = EFFECTS[name]
     assert effect.steps is not None
     profile = recorded(SWAYING).profile
@@ -191,7 +191,7 @@ def test_values_follow_their_steps(name: str) -> None:
         np.testing.assert_allclose(moved, size, rtol=1e-2, atol=1e-12)
 
 
-def test_causes_of_points_have_steps_or_words_but_for_depths_and_lags() -> None:
-    """Those two are a plane and other stamps, which a profile's steps do not reach."""
+def test_causes_of_points_except_depth_and_lag_have_steps_or_words() -> None:
+    """A plane and other timestamps cannot be expressed as steps of a profile."""
     without = {e.name for e in EFFECTS.values() if e.seen_in == GEOMETRY and not e.in_points}
     assert without == {"scene_depth", "frame_lag"}

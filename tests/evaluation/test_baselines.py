@@ -1,4 +1,4 @@
-"""Baselines undo a blur that fits them; the kernels that they are given are the picture's own."""
+"""Baselines remove a blur of their own model, with the frame's own kernels."""
 
 import sys
 
@@ -13,7 +13,7 @@ from virest.evaluation.matching import count_matches
 
 @pytest.fixture
 def psf() -> np.ndarray:
-    """A bent, uneven path whose middle is not its centre of mass."""
+    """A curved, uneven path whose centre differs from its centre of mass."""
     kernel = np.zeros((9, 9), np.float32)
     kernel[[1, 2, 3, 4, 4, 5], [2, 3, 3, 4, 5, 7]] = [0.3, 0.2, 0.1, 0.2, 0.1, 0.1]
     return kernel
@@ -21,7 +21,7 @@ def psf() -> np.ndarray:
 
 @pytest.fixture
 def sharp(rng: np.random.Generator) -> np.ndarray:
-    """Light with edges and lettering, not square."""
+    """Light with edges and letters, not square."""
     grey = cv2.resize(rng.integers(20, 200, (12, 17), np.uint8), (170, 120), interpolation=cv2.INTER_NEAREST)
     cv2.putText(grey, "edges", (12, 70), cv2.FONT_HERSHEY_SIMPLEX, 1.4, 240, 3)
     return grey.astype(np.float32) / 255
@@ -34,8 +34,8 @@ def blurred(sharp: np.ndarray, psf: np.ndarray, rng: np.random.Generator) -> np.
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_a_baseline_undoes_the_blur_of_its_own_kernel(name: str, sharp, psf, rng: np.random.Generator) -> None:
-    """With the true kernel, its best setting at least halves the squared error that the blur makes."""
+def test_a_baseline_removes_the_blur_of_its_own_kernel(name: str, sharp, psf, rng: np.random.Generator) -> None:
+    """With the true kernel, its best setting at least halves the squared error of the blur."""
     baseline = BASELINES[name]
     if not baseline.available:
         pytest.skip(f"{baseline.library} is not installed")
@@ -52,8 +52,8 @@ def test_a_baseline_undoes_the_blur_of_its_own_kernel(name: str, sharp, psf, rng
     assert min(found) < 0.5 * error(observed)
 
 
-def test_a_kernels_spectrum_convolves_about_its_middle(psf) -> None:
-    """A point of light becomes the kernel, its middle where the point was."""
+def test_a_kernel_s_spectrum_convolves_about_its_centre(psf) -> None:
+    """A point of light becomes the kernel, centred at the point."""
     point = np.zeros((24, 31), np.float32)
     point[11, 17] = 1
     spread = filtered(point, psf, lambda k: k)
@@ -62,7 +62,7 @@ def test_a_kernels_spectrum_convolves_about_its_middle(psf) -> None:
 
 
 def test_stronger_weights_make_flatter_pictures(sharp, psf, rng: np.random.Generator) -> None:
-    """Total variation falls as its weight rises; nothing is negative."""
+    """Total variation decreases with its weight, and no value is negative."""
     observed = blended(blurred(sharp, psf, rng), 16)
     variations = []
     for tv in (1.0, 30.0, 900.0):
@@ -73,7 +73,7 @@ def test_stronger_weights_make_flatter_pictures(sharp, psf, rng: np.random.Gener
 
 
 def test_a_blended_border_has_no_step(rng: np.random.Generator) -> None:
-    """A slope that ends far from where it began goes on around the edges without a jump."""
+    """A slope with very different ends continues around the edges without a jump."""
     slope = np.add.outer(np.linspace(0, 3, 40), np.linspace(0, 1, 50)).astype(np.float32)
     wide = blended(slope, 12)
     np.testing.assert_array_equal(wide[12:52, 12:62], slope)
@@ -82,7 +82,7 @@ def test_a_blended_border_has_no_step(rng: np.random.Generator) -> None:
 
 
 def test_a_missing_library_makes_a_baseline_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows of libraries that are not there can be left out; importing the room loads none of them."""
+    """Importing the package loads none of the optional libraries."""
     assert not Baseline(lambda p, k, s: p, (0,), "", library="no_such_library_here").available
     assert BASELINES["inverse"].available
     monkeypatch.delitem(sys.modules, "virest.evaluation.baselines")
@@ -90,8 +90,8 @@ def test_a_missing_library_makes_a_baseline_unavailable(monkeypatch: pytest.Monk
     __import__("virest.evaluation.baselines")
 
 
-def test_blur_costs_matches_and_a_shift_costs_places(sharp, psf, rng: np.random.Generator) -> None:
-    """A picture matches itself best, in place; moved by 6 px it still matches, but elsewhere."""
+def test_blur_reduces_matches_and_a_shift_moves_them(sharp, psf, rng: np.random.Generator) -> None:
+    """A picture matches itself best and in place; shifted by 6 px it still matches, but not in place."""
     grey = np.clip(255 * sharp, 0, 255).astype(np.uint8)
     same = count_matches(grey, grey)
     assert same.good == same.in_place > 20

@@ -1,4 +1,4 @@
-"""Boards drawn at known places are found there, whole, cut off by the edge, or moved."""
+"""Boards drawn at known positions are found there, whether complete, cut off or moved."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ WIDTH, HEIGHT = 480, 360
 
 
 def picture_of(kind: str, turn_rad: tuple[float, float, float] = (0.03, -0.02, 0.05), seed: int = 3) -> np.ndarray:
-    """A board seen by a turned camera, grey."""
+    """A board seen by a rotated camera, in grey."""
     scene = board_scene(BoardSetting("x", kind, WIDTH, HEIGHT, seed=seed), FOCAL_PX)
     chart = np.clip(255 * scene.chart ** (1 / 2.2), 0, 255).astype(np.uint8)
     finer = scene.chart_focal_px
@@ -29,8 +29,8 @@ def picture_of(kind: str, turn_rad: tuple[float, float, float] = (0.03, -0.02, 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_corners_lie_on_a_plane_to_parts_of_a_pixel(kind: str) -> None:
-    """Without distortion all corners fit one homography; none is missing."""
+def test_corners_lie_on_a_plane_with_subpixel_accuracy(kind: str) -> None:
+    """Without distortion all corners fit one homography, and none is missing."""
     board = find_board(picture_of(kind))
     assert board is not None
     assert board.kind == kind
@@ -43,7 +43,7 @@ def test_corners_lie_on_a_plane_to_parts_of_a_pixel(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_moved_board_is_matched_corner_by_corner(kind: str) -> None:
-    """Each corner of a picture moved by 11 px lies 11 px beside the truth's, where half a field is more than that."""
+    """Corners of a picture moved by 11 px lie 11 px from the true ones, although this is close to half a square."""
     picture = picture_of(kind)
     moved = cv2.warpAffine(
         picture, np.array([[1.0, 0, 11], [0, 1, -4]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
@@ -55,8 +55,8 @@ def test_a_moved_board_is_matched_corner_by_corner(kind: str) -> None:
     np.testing.assert_allclose(apart, np.broadcast_to([11.0, -4.0], apart.shape), atol=0.1)
 
 
-def test_a_board_cut_off_by_the_edge_keeps_its_places() -> None:
-    """Three columns beyond the edge: what is left is laid over the same corners of the whole board."""
+def test_a_board_cut_off_by_the_edge_keeps_its_corner_numbers() -> None:
+    """With three columns outside the frame, the others match the same corners of the complete board."""
     picture = picture_of("chessboard", (0.0, 0.0, 0.0))
     truth = find_board(picture)
     assert truth is not None
@@ -67,8 +67,8 @@ def test_a_board_cut_off_by_the_edge_keeps_its_places() -> None:
     np.testing.assert_allclose(found[:, :5], truth.points_px[:, :5], atol=0.1)
 
 
-def test_a_distorted_board_lies_on_a_plane_behind_its_lens() -> None:
-    """Barrel distortion bends the lattice by more than half a pixel; through the lens a plane explains it."""
+def test_a_distorted_board_is_a_plane_through_its_lens() -> None:
+    """Barrel distortion bends the lattice by more than 0.5 px; with the lens model, a plane fits it."""
     lens = Intrinsics(WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, 241.0, 177.0, "radtan", (-0.12, 0.02, 0.0, 0.0, 0.0))
     board = find_board(picture_of("chessboard"))
     assert board is not None
@@ -78,15 +78,15 @@ def test_a_distorted_board_lies_on_a_plane_behind_its_lens() -> None:
     assert np.abs(plane_lattice(bent, lens) - bent.points_px).max() < 0.15
 
 
-def test_a_leafy_wall_has_no_board(rng: np.random.Generator) -> None:
-    """Nothing is made of a picture without a board."""
+def test_texture_without_a_board_gives_no_board(rng: np.random.Generator) -> None:
+    """No board is found in random texture."""
     noise = cv2.resize(rng.uniform(0, 255, (40, 60)).astype(np.float32), (480, 320), interpolation=cv2.INTER_CUBIC)
     assert find_board(np.clip(noise, 0, 255).astype(np.uint8)) is None
 
 
 @pytest.mark.parametrize(("width", "height", "axis"), [(640, 480, 1), (480, 640, 0)])
 def test_the_motion_is_across_the_readout(width: int, height: int, axis: int) -> None:
-    """A phone on its side turns about y, an upright one about x: across the rows or columns that are read."""
+    """A landscape phone turns about y, a portrait one about x: across the rows or columns that are read."""
     motion = sideways_motion(BoardSetting("x", "chessboard", width, height, turn_rad_s=2.0, seed=5))
     rate = np.abs(motion.rate_rad_s(np.linspace(0, 2, 500)))
     assert int(rate.max(axis=0).argmax()) == axis
@@ -94,7 +94,7 @@ def test_the_motion_is_across_the_readout(width: int, height: int, axis: int) ->
 
 
 def test_a_session_shows_the_board_at_its_depth() -> None:
-    """Near boards stand on a plane at their depth, and all of the board is seen at the middle of the motion."""
+    """Near boards are on a plane at their depth, and the complete board is visible in the middle of the motion."""
     setting = BoardSetting("x", "aprilgrid", WIDTH, HEIGHT, frames=4, turn_rad_s=0.5, travel_m_s=0.3, depth_m=1.4)
     session = board_session(setting)
     assert session.scene.depth_m == 1.4

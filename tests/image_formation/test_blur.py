@@ -1,4 +1,4 @@
-"""The space-variant blur: windows that sum to one, the laws of operators, and plain sums as its judge."""
+"""The space-variant blur: windows that sum to 1, the laws of operators, and comparison with plain sums."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Sizes = tuple[int, int, int, int]
 
 
 def _kernels(count: int, radius: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Lopsided kernels that sum to one, each its own, with negative values."""
+    """Different asymmetric kernels that sum to 1, with negative values."""
     kernels = rng.normal(0.2, 1, (count, 2 * radius + 1, 2 * radius + 1))
     kernels[:, :radius] *= 0.3
     kernels[:, :, : radius - 1] *= 0.2
@@ -37,7 +37,7 @@ def _operator(sizes: Sizes, rng: np.random.Generator, radius: int = 5) -> SpaceV
 
 @pytest.mark.parametrize("sizes", GRIDS)
 def test_windows_sum_to_one(sizes: Sizes) -> None:
-    """Everywhere in the picture the windows of all tiles add up to 1, and none is negative."""
+    """At every pixel the windows of all tiles sum to 1, and none is negative."""
     height, width, side, _ = sizes
     grid = tile_grid(*sizes)
     total = np.zeros((grid.tops[-1] + side, grid.lefts[-1] + side))
@@ -49,8 +49,8 @@ def test_windows_sum_to_one(sizes: Sizes) -> None:
 
 
 @pytest.mark.parametrize("sizes", GRIDS)
-def test_centres_are_the_tiles_middles_inside_the_picture(sizes: Sizes) -> None:
-    """Centres come in the order of the corners, x first, and lie in the picture."""
+def test_centres_are_tile_centres_inside_the_frame(sizes: Sizes) -> None:
+    """Centres have the order of the corners, x first, and lie in the frame."""
     height, width, side, _ = sizes
     grid = tile_grid(*sizes)
     assert len(grid.centres_px) == len(list(grid.corners())) == len(grid.windows())
@@ -60,8 +60,8 @@ def test_centres_are_the_tiles_middles_inside_the_picture(sizes: Sizes) -> None:
 
 
 @pytest.mark.parametrize("sizes", GRIDS)
-def test_blur_obeys_the_laws(sizes: Sizes, rng: np.random.Generator) -> None:
-    """It is linear, its adjoint is its transpose, and it neither makes nor loses light."""
+def test_the_blur_is_linear_and_conserves_light(sizes: Sizes, rng: np.random.Generator) -> None:
+    """It is linear, its adjoint is its transpose, and it conserves light."""
     operator = _operator(sizes, rng)
     latent, seen = operator.latent_shape, sizes[:2]
     assert latent == (sizes[0] + 10, sizes[1] + 10)
@@ -73,7 +73,7 @@ def test_blur_obeys_the_laws(sizes: Sizes, rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("sizes", GRIDS)
 def test_equal_kernels_are_one_correlation(sizes: Sizes, rng: np.random.Generator) -> None:
-    """With the same lopsided kernel in every tile the blur is OpenCV's correlation, up to the picture's edge."""
+    """With the same asymmetric kernel in every tile the blur equals OpenCV's correlation, edges included."""
     grid = tile_grid(*sizes)
     kernel = _kernels(1, 4, rng)[0]
     operator = SpaceVariantBlur(grid, np.repeat(kernel[None], len(grid.centres_px), axis=0))
@@ -82,8 +82,8 @@ def test_equal_kernels_are_one_correlation(sizes: Sizes, rng: np.random.Generato
     np.testing.assert_allclose(operator.apply(sharp), expected, atol=2e-4)
 
 
-def test_a_kernel_gathers_from_where_it_is_set() -> None:
-    """A kernel with 1 at d = (+3, −2) shows at each pixel what lies three to the right and two above."""
+def test_a_kernel_gathers_from_its_offset() -> None:
+    """A kernel with 1 at d = (+3, −2) shows at each pixel the value 3 px to the right and 2 px above."""
     grid = tile_grid(50, 70, 32, 8)
     kernels = np.zeros((len(grid.centres_px), 9, 9), np.float32)
     kernels[:, 4 - 2, 4 + 3] = 1
@@ -93,7 +93,7 @@ def test_a_kernel_gathers_from_where_it_is_set() -> None:
 
 
 def test_different_kernels_are_blended_by_the_windows(rng: np.random.Generator) -> None:
-    """G = Σ_r w_r (k_r ⋆ f), by one plain correlation of the whole picture for each tile."""
+    """G = Σ_r w_r (k_r ⋆ f), computed with one plain correlation of the frame per tile."""
     sizes = (75, 118, 48, 12)
     grid = tile_grid(*sizes)
     kernels = _kernels(len(grid.centres_px), 6, rng)
@@ -108,7 +108,7 @@ def test_different_kernels_are_blended_by_the_windows(rng: np.random.Generator) 
 
 
 def test_nothing_wraps_around() -> None:
-    """A light at one edge leaves no trace at the opposite one."""
+    """Light at one edge does not appear at the opposite one."""
     grid = tile_grid(60, 84, 48, 12)
     kernels = np.full((len(grid.centres_px), 11, 11), 1 / 121, np.float32)
     operator = SpaceVariantBlur(grid, kernels)
@@ -120,7 +120,7 @@ def test_nothing_wraps_around() -> None:
 
 
 def test_fast_sizes_are_even_and_large_enough() -> None:
-    """A transform's size is never too small, and even, as the packed spectra need."""
+    """A transform is never too small, and its size is even, as the packed spectra require."""
     for at_least in (1, 63, 64, 65, 200, 1000, 1025, 2049):
         assert fast_size(at_least) >= at_least
         assert fast_size(at_least) % 2 == 0, at_least

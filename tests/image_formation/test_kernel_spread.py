@@ -1,4 +1,4 @@
-"""Kernels whose path is not known exactly."""
+"""Kernels with an uncertain path."""
 
 import numpy as np
 
@@ -9,14 +9,14 @@ SIZE = 64
 
 
 def _slanted(centres_px: np.ndarray) -> KernelField:
-    """A path of (7, 3) pixels, slightly bent, about its middle."""
+    """A path of (7, 3) px, slightly curved, about its middle."""
     part = (np.arange(40) + 0.5) / 40 - 0.5
     path = np.stack([7 * part, 3 * part + 2 * part**2], -1)
     return KernelField(centres_px, np.broadcast_to(path, (len(centres_px), 40, 2)), 0.5)
 
 
-def test_the_variance_is_that_of_many_drawn_paths(rng):
-    """Var K by four points agrees with a thousand draws of the path's end, while the spread is well below a period."""
+def test_the_variance_matches_randomly_drawn_paths(rng):
+    """Var K from four points agrees with 1000 random path ends at frequencies with a period well above the spread."""
     covariance = np.array([[0.09, 0.03], [0.03, 0.04]])
     spread = kernel_spread(_slanted, 60, 40, covariance)
     assert spread is not None
@@ -33,8 +33,8 @@ def test_the_variance_is_that_of_many_drawn_paths(rng):
     np.testing.assert_allclose(spread.variance(SIZE)[low], expected, atol=0.25 * expected.max())
 
 
-def test_frequencies_between_those_worked_out_follow():
-    """A spectrum of many frequencies is that of few where both have the same, whatever kernels fit into either."""
+def test_frequencies_are_interpolated():
+    """Spectra with many and with few frequencies agree at their common frequencies."""
     spread = kernel_spread(_slanted, 60, 40, np.array([[0.09, 0.03], [0.03, 0.04]]))
     assert spread is not None
     few, many = spread.variance(15), spread.variance(15 * 16)
@@ -43,5 +43,5 @@ def test_frequencies_between_those_worked_out_follow():
 
 
 def test_a_known_path_has_no_spread():
-    """Nothing is taken from a kernel that is known."""
+    """A zero covariance gives no spread."""
     assert kernel_spread(_slanted, 60, 40, np.zeros((2, 2))) is None

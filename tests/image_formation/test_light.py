@@ -1,4 +1,4 @@
-"""Flicker and vignetting: by hand, as means over exposures, and through the kernels."""
+"""Flicker and vignetting: hand calculations, means over exposures, and effects on kernels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def extended(**extensions: float) -> CameraProfile:
 
 
 def test_the_mean_flicker_of_a_row_is_the_mean_over_its_exposure() -> None:
-    """Each row's factor is the mean of 1 + a sin(2π f t + φ) over [start, start + exposure] of that row."""
+    """Each row's factor is the mean of 1 + a sin(2π f t + φ) over the row's exposure."""
     profile = extended(flicker_amplitude=0.3, flicker_frequency_hz=100.0, flicker_phase_rad=0.7)
     motion = TurningCamera(profile, exposure_s=0.013).motion
     instants = motion.row_time_s(PIXELS, 0.0)[:, None] + (np.arange(4000) + 0.5) / 4000 * 0.013
@@ -38,21 +38,24 @@ def test_the_mean_flicker_of_a_row_is_the_mean_over_its_exposure() -> None:
 
 
 def test_a_whole_period_of_flicker_leaves_no_bands() -> None:
-    """10 ms at 100 Hz: every row gathers the same light."""
+    """With 10 ms at 100 Hz every row gathers the same light."""
     profile = extended(flicker_amplitude=0.3, flicker_frequency_hz=100.0)
     np.testing.assert_allclose(row_light(TurningCamera(profile, exposure_s=0.010).motion, PIXELS), 1.0, atol=1e-12)
 
 
-def test_vignetting_worked_by_hand() -> None:
-    """A loss of 0.4 at half the diagonal; at a quarter of it 0.1; none in the middle of a picture 200 by 136."""
+def test_vignetting_matches_a_hand_calculation() -> None:
+    """The loss is 0.4 at half the diagonal, 0.1 at a quarter, and 0 at the centre of a frame of 200 × 136."""
     profile = extended(vignetting_corner_loss=0.4)
     quarter = np.hypot(200, 136) / 4
     x, y = np.array([99.5, 99.5 + quarter, -0.5, 99.5]), np.array([67.5, 67.5, -0.5, 67.5 - quarter])
     np.testing.assert_allclose(vignetting(profile, x, y), [1.0, 0.9, 0.6, 0.9], atol=1e-12)
 
 
-def test_a_field_of_gain_multiplies_the_vignetting_in_program_and_simulator_alike() -> None:
-    """A tenth more light on the right, a loss of 0.4 in the corners: factors multiply."""
+def test_a_field_of_gain_multiplies_the_vignetting() -> None:
+    """The product holds in the program and in the simulator.
+
+    10 % more light on the right, a loss of 0.4 in the corners.
+    """
     lens = extended(vignetting_corner_loss=0.4)
     width, height = lens.width, lens.height
     ends = ((0.0, width - 1.0), (0.0, height - 1.0))
@@ -70,8 +73,8 @@ def test_a_field_of_gain_multiplies_the_vignetting_in_program_and_simulator_alik
     assert (light.recorded.dtype, light.kept.dtype) == (np.float32, np.float32)
 
 
-def test_vignetting_goes_where_the_pixel_goes() -> None:
-    """What is recorded at p and belongs at q loses p's vignetting and gets q's."""
+def test_vignetting_follows_the_straightened_pixel() -> None:
+    """Light recorded at p and belonging at q loses p's vignetting and gets q's."""
     profile = extended(vignetting_corner_loss=0.5)
     motion = TurningCamera(profile, rate_rad_s=(0.5, -3.0, 0.4)).motion
     light = frame_light(motion, 0.5, straighten=True)
@@ -88,7 +91,7 @@ def test_vignetting_goes_where_the_pixel_goes() -> None:
 
 
 def test_clipped_light_is_not_darkened_for_a_bright_row() -> None:
-    """A clipped pixel in a row that flicker made brighter stays as bright as clipping; a measured one is evened."""
+    """A clipped pixel in a row brightened by flicker stays clipped; a measured one is corrected."""
     profile = extended(flicker_amplitude=0.3, flicker_frequency_hz=50.0, flicker_phase_rad=0.4)
     light = frame_light(TurningCamera(profile, exposure_s=0.002).motion, 0.5, straighten=False)
     assert light is not None
@@ -100,7 +103,7 @@ def test_clipped_light_is_not_darkened_for_a_bright_row() -> None:
 
 
 def test_defocus_spreads_a_kernel_by_its_variance() -> None:
-    """The second moments of a kernel grow by σ² along both axes, and its sum and middle stay."""
+    """The second moments of a kernel grow by σ² along both axes; its sum and centre stay."""
     motion = TurningCamera(phone(), rate_rad_s=(0.9, -2.0, 0.6)).motion
     blurred = TurningCamera(extended(defocus_sigma_px=1.4), rate_rad_s=(0.9, -2.0, 0.6)).motion
     centres = np.array([[50.0, 100.0], [160.0, 30.0]])
@@ -120,7 +123,7 @@ def test_defocus_spreads_a_kernel_by_its_variance() -> None:
 
 
 def test_flicker_weights_the_instants_of_a_path() -> None:
-    """A light that is brighter late in the exposure moves the kernel's centre towards the path's end by that much."""
+    """Light that is brighter late in the exposure moves the kernel's centre towards the end of the path."""
     profile = extended(flicker_amplitude=0.8, flicker_frequency_hz=20.0, flicker_phase_rad=0.2)
     motion = TurningCamera(profile, rate_rad_s=(0.0, -2.0, 0.0)).motion
     centre = np.array([[104.0, 63.92]])

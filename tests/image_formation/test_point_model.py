@@ -1,4 +1,4 @@
-"""Predicted points against an independent generator; slopes against difference quotients; times of rows."""
+"""Predicted points compared with an independent generator, derivatives with difference quotients, and row times."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ WINDOWS = [list(range(13)), list(range(13, 29))]
 
 
 @pytest.mark.parametrize("setup", FAR.values(), ids=FAR)
-def test_points_far_away_are_predicted_to_a_hundredth_of_a_pixel(setup: Setup) -> None:
-    """Turning only: motion of 13 px a frame, rows, exposures, clock and lens all as the generator makes them."""
+def test_distant_points_are_predicted_within_a_hundredth_of_a_pixel(setup: Setup) -> None:
+    """Pure rotation, with rows, exposures, clock and lens of the generator."""
     recording, table = recorded(setup), recorded(setup).table()
     found = predict(integrate_motion(recording.imu, recording.profile, translation=False), table, None)
     assert np.median(np.linalg.norm(table.second_px - table.first_px, axis=1)) > 5
@@ -60,10 +60,10 @@ def test_points_far_away_are_predicted_to_a_hundredth_of_a_pixel(setup: Setup) -
 
 @pytest.mark.parametrize("windows", [None, WINDOWS], ids=["one window", "two windows"])
 @pytest.mark.parametrize("setup", NEAR.values(), ids=NEAR)
-def test_points_on_a_wall_are_predicted_to_a_hundredth_of_a_pixel(
+def test_points_on_a_wall_are_predicted_within_a_hundredth_of_a_pixel(
     setup: Setup, windows: list[list[int]] | None
 ) -> None:
-    """Turning and swaying before a wall, with the true velocity, gravity, bias, delay and plane of each window."""
+    """Rotation and sway in front of a wall, with the true velocity, gravity, bias, delay and plane of each window."""
     recording, table = recorded(setup), recorded(setup).table(windows)
     known = integrate_motion(recording.imu, recording.profile, translation=True)
     found = predict(known, table, recording.scene(table))
@@ -73,8 +73,8 @@ def test_points_on_a_wall_are_predicted_to_a_hundredth_of_a_pixel(
 
 
 @pytest.mark.parametrize("setup", NEAR.values(), ids=NEAR)
-def test_slopes_of_the_motion_are_difference_quotients(setup: Setup) -> None:
-    """Each entry of the motion's vector, the planes' to 0.2 %; the others leave out how the path changes depths."""
+def test_derivatives_of_the_motion_match_difference_quotients(setup: Setup) -> None:
+    """Those of the planes agree within 0.2 %; the others neglect how the path changes the depths."""
     recording, table = recorded(setup), recorded(setup).table(WINDOWS)
     known, scene = integrate_motion(recording.imu, recording.profile, translation=True), recording.scene(table)
     slopes = predict(known, table, scene, slopes=True).slopes
@@ -89,8 +89,8 @@ def test_slopes_of_the_motion_are_difference_quotients(setup: Setup) -> None:
         assert np.abs(slopes[..., entry] - quotient).max() < (0.002 if planes else 0.12) * np.abs(quotient).max(), entry
 
 
-def test_parallax_of_a_direction_lies_along_what_travel_does() -> None:
-    """Points at any depth leave the turning's prediction along the flow of the camera's true direction."""
+def test_parallax_lies_along_the_direction_of_travel() -> None:
+    """Points at any depth deviate from the rotation's prediction along the flow of the camera's true direction."""
     setup = Setup(seed=9, noise_px=0.0, velocity_m_s=(0.4, -0.3, 1.5), inverse_depth_per_m=(0.02, 0.2), about=(0, 0, 0))
     recording, table = recorded(setup), recorded(setup).table()
     known = integrate_motion(recording.imu, recording.profile, translation=False)
@@ -102,13 +102,13 @@ def test_parallax_of_a_direction_lies_along_what_travel_does() -> None:
     across = moved[:, 0] * unit[:, 1] - moved[:, 1] * unit[:, 0]
     assert np.quantile(np.linalg.norm(moved, axis=1), 0.9) > 2
     assert np.abs(across).max() < 0.02
-    # c₁ − c₂ points back along the travel
+    # c₁ − c₂ points against the direction of travel
     assert ((moved * unit).sum(axis=1) < 0.01).all()
 
 
 @pytest.mark.parametrize("setup", NEAR.values(), ids=NEAR)
-def test_the_way_of_parallax_is_the_same_with_slopes_and_without(setup: Setup) -> None:
-    """By a difference quotient or by the lens's slope: pixels per inverse depth along what the camera travels."""
+def test_the_direction_of_parallax_is_the_same_with_derivatives(setup: Setup) -> None:
+    """A difference quotient and the lens's derivative give the same pixels per inverse depth."""
     recording, table = recorded(setup), recorded(setup).table()
     known, scene = integrate_motion(recording.imu, recording.profile, translation=True), recording.scene(table)
     quick, exact = (predict(known, table, scene, slopes=slopes).along_px for slopes in (False, True))
@@ -118,8 +118,8 @@ def test_the_way_of_parallax_is_the_same_with_slopes_and_without(setup: Setup) -
 
 
 @pytest.mark.parametrize("exposure_s", [0.0005, 0.004, 0.013])
-def test_pulsing_lamps_move_the_mean_time_of_the_light(exposure_s: float) -> None:
-    """Against the integral of the light over the exposure."""
+def test_flicker_moves_the_mean_time_of_the_light(exposure_s: float) -> None:
+    """The delay equals the integral of the light over the exposure."""
     profile = recorded(Setup()).profile
     pulsing = replace(profile.extensions, flicker_amplitude=0.6, flicker_frequency_hz=100.0, flicker_phase_rad=0.4)
     profile = replace(profile, extensions=pulsing)
@@ -131,11 +131,11 @@ def test_pulsing_lamps_move_the_mean_time_of_the_light(exposure_s: float) -> Non
     np.testing.assert_allclose(found_s, expected_s, atol=1e-6 * exposure_s)
 
 
-# ── the gyroscope's part ─────────────────────────────────────────────────────────────────────────────────────────
+# ── the gyroscope ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_angular_acceleration_is_the_slope_of_the_rate() -> None:
-    """Against the generator's rate, differentiated numerically, and nowhere else than in camera axes."""
+def test_angular_acceleration_is_the_derivative_of_the_rate() -> None:
+    """It equals the numerical derivative of the generator's rate, in camera axes."""
     recording = recorded(FAR["portrait, read from the right"])
     trajectory = integrate_gyro(recording.imu, recording.profile)
     time_s = np.array([[0.1007, 0.3333], [0.5, 0.9114]])
@@ -148,7 +148,7 @@ def test_angular_acceleration_is_the_slope_of_the_rate() -> None:
 
 
 def test_mean_orientation_is_the_mean_over_the_exposure() -> None:
-    """SciPy's mean of the orientations over 40 ms, to 2 % of what the exposure bends; over no time, the middle's."""
+    """It agrees with SciPy's mean within 5 % of its distance to the middle's; without exposure it is the middle's."""
     recording = recorded(replace(FAR["portrait, read from the right"], rate_rad_s=1.5))
     trajectory = integrate_gyro(recording.imu, recording.profile)
     middle_s, exposure_s = np.array([0.21, 0.4, 0.77]), np.array([0.04, 0.03, 0.04])
@@ -173,11 +173,11 @@ def test_mean_orientation_is_the_mean_over_the_exposure() -> None:
     np.testing.assert_allclose(mean.per_world(np.tile(np.eye(3), (3, 1, 1))), by_world, atol=1e-14)
 
 
-# ── times of rows ────────────────────────────────────────────────────────────────────────────────────────────────
+# ── row times ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def phone(readout_s: float, direction: str) -> CameraProfile:
-    """A phone whose size, stamp and clock are nothing special."""
+    """A phone with an ordinary size, timestamp and clock."""
     return CameraProfile(
         480, 640, shutter=Shutter(readout_s, direction, "exposure_end", 0.9), time_offset_s=0.031, clock_skew=0.0
     )
@@ -187,8 +187,8 @@ POINTS_PX = np.random.default_rng(5).uniform((0, 0), (480, 640), (50, 2))
 
 
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
-def test_a_readout_below_nought_is_one_the_other_way(direction: str) -> None:
-    """Every point is seen at the same time before and after the profile is put right, and twice changes nothing."""
+def test_a_negative_readout_time_reverses_the_direction(direction: str) -> None:
+    """Every point keeps its time when the profile is corrected, and a second correction changes nothing."""
     backwards = phone(-0.0193, direction)
     right = right_way_round(backwards)
     assert right.shutter.readout_time_s == 0.0193
@@ -201,8 +201,8 @@ def test_a_readout_below_nought_is_one_the_other_way(direction: str) -> None:
 
 
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
-def test_the_readouts_step_keeps_the_middle_row(direction: str) -> None:
-    """From +12 ms through nought to −9 ms: the row at half the readout keeps its time, the others turn about it."""
+def test_a_step_of_the_readout_keeps_the_middle_row(direction: str) -> None:
+    """From +12 ms to −9 ms, the row at half the readout keeps its time and the others move about it."""
     before, after = phone(0.012, direction), terms_of.add_readout(phone(0.012, direction), np.array([-0.021]))
     assert after.shutter.readout_time_s == pytest.approx(-0.009)
     fraction = before.shutter.readout_fraction(POINTS_PX, 480, 640)
@@ -210,14 +210,14 @@ def test_the_readouts_step_keeps_the_middle_row(direction: str) -> None:
     np.testing.assert_allclose(change, -0.021 * (fraction - 0.5), atol=1e-12)
 
 
-# ── the table and what is kept ───────────────────────────────────────────────────────────────────────────────────
+# ── the table and cached integrations ────────────────────────────────────────────────────────────────────────────
 
 TERMS = [value for value in vars(terms_of).values() if isinstance(value, Term)]
 
 
 @pytest.mark.parametrize("term", TERMS, ids=lambda term: term.name)
-def test_what_is_kept_from_profile_to_profile_changes_no_prediction(term: Term) -> None:
-    """A ground carried over to a changed profile predicts like one made afresh, with and without translation."""
+def test_a_cached_integration_gives_the_same_predictions(term: Term) -> None:
+    """An integration adapted to a changed profile predicts like a new one, with and without translation."""
     setup = replace(NEAR["long arm, skewed clock"], points=4)
     recording, table = recorded(setup), recorded(setup).table()
     known = integrate_motion(recording.imu, recording.profile, translation=True)
@@ -231,8 +231,8 @@ def test_what_is_kept_from_profile_to_profile_changes_no_prediction(term: Term) 
 
 
 @pytest.mark.parametrize("term", TERMS, ids=lambda term: term.name)
-def test_a_terms_steps_add_up_and_can_be_taken_back(term: Term) -> None:
-    """Each value alone: two steps are one of their sum, and the step back leads home."""
+def test_the_steps_of_a_term_add_up_and_are_reversible(term: Term) -> None:
+    """For each parameter, two steps equal one of their sum, and the opposite step restores the prediction."""
     setup = replace(NEAR["long arm, skewed clock"], points=4, stabilised=(0.3, 0.8), k1=0.02)
     recording, table = recorded(setup), recorded(setup).table()
 
@@ -248,8 +248,8 @@ def test_a_terms_steps_add_up_and_can_be_taken_back(term: Term) -> None:
         np.testing.assert_allclose(predicted(term.change(once, -step)), predicted(recording.profile), atol=1e-6)
 
 
-def test_table_lays_out_pairs_in_windows() -> None:
-    """Pairs rise from 0, each with its window; a window's origin is the middle of its pairs' stamps."""
+def test_the_table_arranges_pairs_in_windows() -> None:
+    """Pairs are numbered from 0, each with its window; the origin of a window is the mean of its timestamps."""
     recording = recorded(Setup(frames=9, points=5))
     table = recording.table([[0, 1, 2, 3, 4], [5, 6, 7]])
     assert table.n_pairs == 8

@@ -1,4 +1,4 @@
-"""Rows in time and poses between times, against SciPy's rotations at a constant rate."""
+"""Row times and poses between times, compared with SciPy's rotations at a constant rate."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from virest.motion.relief_surface import Relief
 CAMERA = TurningCamera(phone(), velocity_m_s=(0.4, -0.25, 0.6))
 
 
-def test_poses_are_those_of_a_constant_turn() -> None:
-    """At a constant rate ω, R_t_ref = exp(−ω (t − ref)): through bias, scale, mounting and clock of the gyroscope."""
+def test_poses_at_a_constant_rate() -> None:
+    """At rate ω, R_t_ref = exp(−ω (t − ref)), for any bias, scale, mounting and clock of the gyroscope."""
     motion = CAMERA.motion
     time_s = motion.start_s + np.linspace(0, 0.03, 7)
     rotation, _ = motion.pose(time_s)
@@ -28,7 +28,7 @@ def test_poses_are_those_of_a_constant_turn() -> None:
     np.testing.assert_allclose(rotation, expected, atol=1e-9)
 
 
-def test_poses_carry_the_translation() -> None:
+def test_poses_include_the_translation() -> None:
     """A point fixed in the world is at R_t_ref (X − v (t − ref)) in camera axes."""
     motion = CAMERA.motion
     point, velocity = np.array([0.3, -0.2, 2.5]), np.array(CAMERA.velocity_m_s)
@@ -42,10 +42,10 @@ def test_poses_carry_the_translation() -> None:
 SWAY = FrameTranslation(
     np.array([0.4, -0.25, 0.6]), np.array([-3.0, 5.0, 2.0]), np.array([0.08, -0.11, 0.45]), 1 / 0.45, "profile"
 )
-"""A camera that also accelerates, before a plane that leans away."""
+"""An accelerating camera in front of a tilted plane."""
 
 
-def test_an_accelerated_camera_is_where_the_law_puts_it() -> None:
+def test_the_position_of_an_accelerated_camera() -> None:
     """The centre is at v (t − ref) + ½ a (t − ref)² in the axes at the reference; its velocity is v + a (t − ref)."""
     motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=SWAY)
     since = 0.0231
@@ -57,8 +57,8 @@ def test_an_accelerated_camera_is_where_the_law_puts_it() -> None:
 
 
 @pytest.mark.parametrize("apart_s", [1 / 30, 0.1, -0.1])
-def test_between_two_frames_the_camera_goes_from_the_ones_motion_to_the_others(apart_s: float) -> None:
-    """A hand sways by 3 cm at 2.5 Hz: extrapolated from one frame, it is 14 mm off in another 0.1 s later."""
+def test_motion_between_two_frames_joins_their_motions(apart_s: float) -> None:
+    """A hand sways by 3 cm at 2.5 Hz: extrapolation from one frame is 14 mm off in another 0.1 s later."""
     sway_m, per_s = np.array([0.03, -0.02, 0.01]), 2 * np.pi * 2.5
 
     def at(stamp_s: float) -> RowMotion:
@@ -84,8 +84,8 @@ def test_between_two_frames_the_camera_goes_from_the_ones_motion_to_the_others(a
     np.testing.assert_allclose(centre, expected, atol=8e-4)
 
 
-def test_the_plane_stays_where_it_is_while_the_camera_moves() -> None:
-    """A point on the plane has, at any time, the inverse depth that the plane gives on the ray to it."""
+def test_the_plane_is_fixed_in_the_world() -> None:
+    """A point on the plane has, at any time, the inverse depth that the plane gives for its ray."""
     motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=SWAY)
     rays = np.array([[0.3, -0.2, 1.0], [-0.4, 0.25, 1.0]])
     points = rays / (rays @ SWAY.inverse_depth_plane)[:, None]
@@ -106,8 +106,8 @@ BUMP = Relief(
 )
 
 
-def test_a_surface_stays_where_it_is_while_the_camera_moves() -> None:
-    """A point on the surface has, at any time, the inverse depth that the surface gives on the ray to it."""
+def test_a_surface_is_fixed_in_the_world() -> None:
+    """A point on the surface has, at any time, the inverse depth that the surface gives for its ray."""
     motion = row_motion(CAMERA.trajectory, CAMERA.profile, 0.1, 0.012, translation=replace(SWAY, relief=BUMP))
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 6))
     rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=-1)
@@ -122,7 +122,7 @@ def test_a_surface_stays_where_it_is_while_the_camera_moves() -> None:
 
 
 def test_relative_poses_compose() -> None:
-    """From a to b and from b to c is from a to c, in turn and shift; there and back is nothing."""
+    """The pose from a to b and from b to c equals that from a to c; there and back is the identity."""
     motion = CAMERA.motion
     a, b, c = motion.start_s + np.array([0.001, 0.0113, 0.0278])
     (r_ab, t_ab), (r_bc, t_bc), (r_ac, t_ac) = (motion.relative_pose(*p) for p in ((a, b), (b, c), (a, c)))
@@ -134,8 +134,8 @@ def test_relative_poses_compose() -> None:
     np.testing.assert_allclose(r_ba @ t_ab + t_ba, 0, atol=1e-13)
 
 
-def test_the_reference_is_at_rest_with_itself() -> None:
-    """At the reference time nothing has moved, whichever reference was asked for."""
+def test_the_pose_at_the_reference_is_the_identity() -> None:
+    """Nothing has moved at the reference time, for either kind of reference."""
     for reference in ("exposure-start", "frame-middle"):
         motion = replace(CAMERA, reference=reference).motion
         rotation, translation = motion.pose(motion.reference_s)
@@ -144,14 +144,14 @@ def test_the_reference_is_at_rest_with_itself() -> None:
 
 
 def test_without_a_velocity_only_the_rotation_is_known() -> None:
-    """An unknown translation is None, never a silent zero."""
+    """An unknown translation is None and never zero."""
     motion = TurningCamera(phone()).motion
     assert motion.translation_m is None
     assert motion.relative_pose(motion.start_s, motion.start_s + 0.01)[1] is None
 
 
-def test_times_of_a_frame_worked_by_hand() -> None:
-    """Stamp 2 s at the exposure's end, 10 ms logged x 1.2 = 12 ms: start 1.988 s, then skew 1e-3 and offset 0.05 s."""
+def test_times_of_a_frame_match_a_hand_calculation() -> None:
+    """Timestamp 2 s at exposure end, 10 ms logged × 1.2 = 12 ms: start 1.988 s, then skew 1e-3 and offset 0.05 s."""
     shutter = Shutter(0.02, "bottom_to_top", "exposure_end", 1.2)
     profile = phone(shutter=shutter, clock_skew=1e-3, time_offset_s=0.05)
     camera = TurningCamera(profile, stamp_s=2.0, exposure_s=0.010, reference="frame-middle")
@@ -162,8 +162,8 @@ def test_times_of_a_frame_worked_by_hand() -> None:
     assert replace(camera, reference="exposure-start").motion.reference_s == motion.start_s
 
 
-def test_an_unknown_exposure_counts_as_none() -> None:
-    """Without an exposure time the rows' starts are still known, and the exposure is 0."""
+def test_an_unknown_exposure_counts_as_zero() -> None:
+    """The start of each row is still known."""
     motion = TurningCamera(phone(), exposure_s=None).motion
     assert motion.exposure_s == 0.0
     assert motion.start_s == pytest.approx(0.1 * (1 + 2e-4) + 0.0031)
@@ -178,8 +178,8 @@ def test_rows_start_at_their_own_times(direction: str) -> None:
     np.testing.assert_allclose(motion.row_time_s(points, 0.0), camera.row_start_s(points, motion.start_s), atol=1e-12)
 
 
-def test_the_table_follows_a_shaking_hand() -> None:
-    """At 6 Hz and 3 rad/s the tabulated pose is the trajectory's to a micro-radian, between the grid's points too."""
+def test_the_pose_table_follows_a_shaking_hand() -> None:
+    """At 6 Hz and 3 rad/s the tabulated pose is accurate to 1 µrad, also between grid points."""
     time_s = np.arange(-0.2, 0.5, 0.0025)
     rate = 3.0 * np.sin(2 * np.pi * 6 * time_s[:, None] + np.array([0.3, 1.9, 4.0]))
     profile = phone()
@@ -191,8 +191,8 @@ def test_the_table_follows_a_shaking_hand() -> None:
     np.testing.assert_allclose(motion.pose(at)[0], expected, atol=1e-6)
 
 
-def test_a_further_turn_is_integrated_about_the_camera_s_own_axes():
-    """A rate that changes from pair to pair, on top of a fast turn, gives the camera that turns by both."""
+def test_an_additional_rotation_is_integrated_in_camera_axes():
+    """A rate that changes from pair to pair is added to a fast rotation."""
     rate, time_s = np.array([0.8, -1.5, 2.0]), np.linspace(-0.1, 0.3, 801)
     further = FurtherTurn(np.array([0.0, 0.04]), np.array([[0.3, 0.0, 0.0], [0.0, -0.2, 0.0]]))
     lacking = np.stack([np.interp(time_s, further.time_s, along) for along in further.rate_rad_s.T], -1)

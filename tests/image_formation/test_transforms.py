@@ -1,4 +1,4 @@
-"""Both libraries' transforms give the same packed spectra, and the choice between them hangs on no clock."""
+"""Both libraries' transforms give the same packed spectra, and the choice between them depends on no timing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIZES = [(4, 4), (8, 6), (64, 80), (128, 128), (192, 160)]
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_pocketfft_packs_as_opencv_does(height: int, width: int, rng: np.random.Generator) -> None:
-    """A spectrum of one library is that of the other, so filters and products need not know which it was."""
+    """Spectra of both libraries are equal, so filters and products work with either."""
     picture = rng.normal(size=(height, width)).astype(np.float32)
     packed = np.empty_like(picture)
     assert transforms.pocketfft_forward(picture, packed) is packed
@@ -23,7 +23,7 @@ def test_pocketfft_packs_as_opencv_does(height: int, width: int, rng: np.random.
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_pocketfft_reads_packed_spectra(height: int, width: int, rng: np.random.Generator) -> None:
-    """Back from OpenCV's spectrum, into a given array and into a new one."""
+    """OpenCV's spectra are inverted into a given array and into a new one, and are not changed."""
     picture = rng.normal(size=(height, width)).astype(np.float32)
     spectrum, into = cv2.dft(picture), np.empty_like(picture)
     kept = spectrum.copy()
@@ -35,7 +35,7 @@ def test_pocketfft_reads_packed_spectra(height: int, width: int, rng: np.random.
 
 @pytest.mark.parametrize("ipp", [True, False])
 def test_the_library_follows_from_build_and_size(ipp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With IPP always OpenCV; without it pocketfft for large tiles of even sides, which all quick sizes have."""
+    """With IPP it is always OpenCV; without it, pocketfft for large tiles with even sides, as all fast sizes have."""
     monkeypatch.setattr(cv2.ipp, "useIPP", lambda: ipp)
     large = transforms.POCKETFFT if not ipp else transforms.OPENCV
     for size in FAST_SIZES:
@@ -45,14 +45,14 @@ def test_the_library_follows_from_build_and_size(ipp: bool, monkeypatch: pytest.
 
 
 def test_a_round_trip_returns_the_picture_without_ipp(rng: np.random.Generator, monkeypatch) -> None:
-    """The chosen pair belongs together: what one packs the other unpacks."""
+    """The forward and inverse transforms belong to the same library."""
     monkeypatch.setattr(cv2.ipp, "useIPP", lambda: False)
     picture = rng.normal(size=(192, 192)).astype(np.float32)
     np.testing.assert_allclose(transforms.inverse(transforms.forward(picture)), picture, atol=1e-5)
 
 
-def test_a_picture_is_blurred_alike_by_either_library(rng: np.random.Generator, monkeypatch) -> None:
-    """Spectra of kernels and tiles, products and the way back: rounding is all that differs."""
+def test_both_libraries_give_the_same_blur(rng: np.random.Generator, monkeypatch) -> None:
+    """Only rounding differs."""
     grid = tile_grid(210, 260, 128, 32)
     kernels = rng.random((len(grid.centres_px), 11, 11)).astype(np.float32)
     light = rng.random((220, 270)).astype(np.float32)

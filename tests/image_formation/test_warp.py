@@ -1,4 +1,4 @@
-"""The one map of points: signs, depth, rows of their own times, and its inverse."""
+"""The map of points: signs, depth, individual row times, and its inverse."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LENSES = [pytest.param(lens, id=lens[0]) for lens in (UNDISTORTED, RADTAN, FISHE
 
 
 def _points() -> NDArray[np.float64]:
-    """Corners and inside of a picture 200 wide and 136 high."""
+    """Corners and inner points of a frame of 200 × 136."""
     inside = np.random.default_rng(3).uniform((0, 0), (199, 135), (40, 2))
     return np.concatenate([corner_points(200, 136), inside])
 
@@ -41,7 +41,7 @@ def _points() -> NDArray[np.float64]:
     ],
 )
 def test_points_move_against_the_camera(axis: str, start: tuple[float, float], expected: tuple[int, int]) -> None:
-    """A camera that turns right moves points left; one that looks up moves them down; clockwise, them anticlockwise."""
+    """Yaw right moves points left, pitch up moves them down, and a clockwise roll moves them anticlockwise."""
     turn = {"yaw right": (0, 1, 0), "pitch up": (1, 0, 0), "roll clockwise": (0, 0, 1)}[axis]
     motion = TurningCamera(phone(), rate_rad_s=turn).motion
     moved = (moved_between(motion, np.array([start]), motion.start_s, motion.start_s + 0.01) - start)[0]
@@ -49,8 +49,8 @@ def test_points_move_against_the_camera(axis: str, start: tuple[float, float], e
     assert np.abs(moved).max() == pytest.approx(0.01 * (76 if axis == "roll clockwise" else 218), rel=0.03)
 
 
-def test_a_turning_phone_moves_points_against_it() -> None:
-    """The same from the gyroscope on: a phone yawing right by 0.8 rad/s sends the middle point left by f ω t."""
+def test_a_turning_phone_moves_points_the_other_way() -> None:
+    """From gyroscope samples, a yaw right of 0.8 rad/s moves the centre point left by f ω t."""
     motion = TurningCamera(phone(), rate_rad_s=(0, 0.8, 0)).motion
     centre = np.array([[104.0, 63.92]])
     moved = moved_between(motion, centre, motion.start_s, motion.start_s + 0.01) - centre
@@ -58,8 +58,8 @@ def test_a_turning_phone_moves_points_against_it() -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_points_with_depth_are_projected_points(lens: tuple[str, tuple[float, ...]]) -> None:
-    """Turn and shift together move a pixel as an explicit point in space at that depth moves."""
+def test_points_with_depth_move_as_projected_points(lens: tuple[str, tuple[float, ...]]) -> None:
+    """Rotation and translation move a pixel like the projection of a point in space at that depth."""
     camera = TurningCamera(phone(lens=lens), velocity_m_s=(0.4, -0.25, 0.6))
     motion, points = camera.motion, _points()
     from_s, to_s = motion.start_s + 0.003, motion.start_s + 0.029
@@ -71,7 +71,7 @@ def test_points_with_depth_are_projected_points(lens: tuple[str, tuple[float, ..
 
 
 def test_each_point_may_have_its_own_depth() -> None:
-    """A list of inverse depths moves each point as it would move alone."""
+    """With a list of inverse depths each point moves as it does alone."""
     motion, points = TurningCamera(phone(), velocity_m_s=(0.4, -0.25, 0.6)).motion, _points()[:3]
     inverse_depth = np.array([0.0, 0.4, 1.5])
     together = straightened_points(AtDepth(motion, inverse_depth), points, 0.5)
@@ -83,8 +83,8 @@ def test_each_point_may_have_its_own_depth() -> None:
 
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
 @pytest.mark.parametrize("lens", LENSES)
-def test_straightened_undoes_recorded(direction: str, lens: tuple[str, tuple[float, ...]]) -> None:
-    """Where a point was recorded, and where that belongs, is the point again: all directions and lenses, both ways."""
+def test_straightening_inverts_recording(direction: str, lens: tuple[str, tuple[float, ...]]) -> None:
+    """A point's recorded position is straightened to the point, for all directions and lenses, and vice versa."""
     camera = TurningCamera(phone(lens=lens, readout_direction=direction), reference="frame-middle")
     motion, points, anchor = camera.motion, _points(), 0.3
     there = recorded_points(motion, points, anchor)
@@ -96,8 +96,8 @@ def test_straightened_undoes_recorded(direction: str, lens: tuple[str, tuple[flo
 
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
 @pytest.mark.parametrize("anchor", [0.0, 0.5, 1.0])
-def test_straightened_points_are_explicit_projections(direction: str, anchor: float) -> None:
-    """A recorded pixel belongs where its ray, at its own row's anchor, is seen at the reference time."""
+def test_straightened_points_match_explicit_projections(direction: str, anchor: float) -> None:
+    """A recorded pixel belongs where its ray at its own row's anchor projects at the reference time."""
     camera = TurningCamera(phone(lens=RADTAN, readout_direction=direction), velocity_m_s=(0.4, -0.25, 0.6))
     motion, points = camera.motion, _points()
     at = camera.row_start_s(points, motion.start_s) + anchor * 0.012
@@ -108,8 +108,8 @@ def test_straightened_points_are_explicit_projections(direction: str, anchor: fl
 
 
 @pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
-def test_a_seen_point_lies_in_the_row_that_sees_it(direction: str) -> None:
-    """What seen_by_rows returns is where the point is at exactly the time of the row that it names."""
+def test_a_recorded_point_lies_in_the_row_that_records_it(direction: str) -> None:
+    """``seen_by_rows`` returns the point's position at exactly the time of the row there."""
     camera = TurningCamera(phone(readout_direction=direction), rate_rad_s=(1.4, -2.2, 0.9))
     motion, points = camera.motion, _points()
     at_s = motion.start_s + 0.007
@@ -118,7 +118,7 @@ def test_a_seen_point_lies_in_the_row_that_sees_it(direction: str) -> None:
     np.testing.assert_allclose(camera.seen(points, at_s, row_s, motion.reference_s), seen, atol=1e-3)
 
 
-def test_a_global_shutter_moves_all_rows_alike() -> None:
+def test_a_global_shutter_needs_no_straightening() -> None:
     """Without a readout, straightening to the exposure's start changes nothing at anchor 0."""
     motion = TurningCamera(phone(readout_time_s=0.0)).motion
     np.testing.assert_allclose(straightened_points(motion, _points()), _points(), atol=1e-9)
@@ -129,8 +129,8 @@ def test_a_global_shutter_moves_all_rows_alike() -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize(("width", "height"), [(200, 136), (131, 257), (97, 65)])
-def test_the_dense_map_is_the_exact_one(lens: tuple[str, tuple[float, ...]], width: int, height: int) -> None:
-    """Filling in between grid points is off by less than 0.02 px at any pixel, at odd sizes too."""
+def test_the_dense_map_is_accurate(lens: tuple[str, tuple[float, ...]], width: int, height: int) -> None:
+    """Interpolation between grid points is off by less than 0.02 px at any pixel, also for odd sizes."""
     profile = phone(width, height, focal_px=1.2 * max(width, height), lens=lens, readout_direction="right_to_left")
     motion = TurningCamera(profile, reference="frame-middle").motion
     x, y = np.meshgrid(np.arange(width), np.arange(height))
@@ -142,7 +142,7 @@ def test_the_dense_map_is_the_exact_one(lens: tuple[str, tuple[float, ...]], wid
 
 
 def test_the_dense_map_follows_a_surface() -> None:
-    """Before relief the map bends where the surface does: mostly off by less than 0.1 px, and back by the other map."""
+    """With relief, the map is mostly off by less than 0.1 px, and the inverse map leads back."""
     camera = TurningCamera(phone(320, 240, focal_px=300.0, readout_direction="right_to_left"))
     values = np.array([[0.0, 0.2, 0.0, 0.0], [0.0, 0.9, 0.1, 0.0], [0.0, 0.0, 0.0, -0.2]], np.float32)
     relief = Relief(np.array([-0.5, -0.4]), np.array([1.0, 0.8]), values, values)
@@ -163,13 +163,13 @@ def test_the_dense_map_follows_a_surface() -> None:
     np.testing.assert_allclose(straightened_points(motion, exact, 0.5), points_px, atol=5e-3)
 
 
-def test_corners_go_round_clockwise_from_the_top_left() -> None:
-    """P1..P4 are the centres of the corner pixels, in the log's order."""
+def test_corners_are_listed_clockwise_from_the_top_left() -> None:
+    """P1 to P4 are the centres of the corner pixels, in the log's order."""
     assert corner_points(7, 5).tolist() == [[0, 0], [6, 0], [6, 4], [0, 4]]
 
 
 def test_geometry_without_a_lens_is_refused() -> None:
-    """Where the focal length is unknown no point can be moved."""
+    """No point can be moved without a focal length."""
     blind = TurningCamera(replace(phone(), intrinsics=None)).motion
     with pytest.raises(ValueError, match="intrinsics"):
         straightened_points(blind, _points())
@@ -177,7 +177,10 @@ def test_geometry_without_a_lens_is_refused() -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_points_of_the_frames_plane_move_as_points_in_space(lens: tuple[str, tuple[float, ...]]) -> None:
-    """Turn, shift, drift and stabiliser together: each end is an explicit projection at its own time."""
+    """Rotation, translation, focal drift and stabilisation together.
+
+    Each end is an explicit projection at its own time.
+    """
     plane = np.array([0.06, -0.1, 0.5])
     sway = FrameTranslation(np.array([0.5, -0.3, 0.2]), np.array([-2.0, 4.0, 1.0]), plane, 2.0, "profile")
     profile = phone(lens=lens)
@@ -200,8 +203,8 @@ def test_points_of_the_frames_plane_move_as_points_in_space(lens: tuple[str, tup
     assert np.abs(there - moved_between(AtDepth(motion, 0.0), points, motion.reference_s, at_s)).max() > 1.0
 
 
-def test_the_stabiliser_holds_the_picture() -> None:
-    """With the whole of yaw and pitch cancelled and next to no cutoff, the picture's middle stays where it is."""
+def test_full_stabilisation_keeps_the_frame_still() -> None:
+    """If yaw and pitch are cancelled completely with a very low cutoff, the centre of the frame stays still."""
     rate = (0.35, -0.8, 0.0)
     motion = TurningCamera(phone(), rate).motion
     time_s = motion.start_s + np.linspace(0, 0.03, 31)
@@ -214,8 +217,8 @@ def test_the_stabiliser_holds_the_picture() -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_the_turn_jacobian_is_that_of_turned_rays(lens: tuple[str, tuple[float, ...]]) -> None:
-    """x' = exp(angle) x, by exact rotations to both sides; of a lens with its distortion."""
+def test_the_rotation_jacobian_matches_rotated_rays(lens: tuple[str, tuple[float, ...]]) -> None:
+    """It equals difference quotients of exact rotations, x' = exp(angle) x, for each lens with its distortion."""
     camera = TurningCamera(phone(lens=lens))
     motion = row_motion(camera.trajectory, camera.profile, 0.1, 0.012)
     points = _points()

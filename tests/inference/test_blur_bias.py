@@ -1,4 +1,4 @@
-"""Lucas-Kanade between differently blurred pictures of one texture, against what the paths alone predict."""
+"""Lucas–Kanade between differently blurred pictures of one texture, compared with the blur paths' prediction."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ GREY = ResponseCurve("gamma", gamma=2.2)
 STILL = np.zeros((2, 2))
 
 
-def test_even_paths_are_found_where_they_are() -> None:
-    """A path at an even speed is symmetric about its mean, however long it is."""
+def test_even_paths_have_no_bias() -> None:
+    """A path at constant speed is symmetric about its mean, whatever its length."""
     rng = np.random.default_rng(1)
     speed, still = rng.normal(0, 3, (2, 50, 2)), np.zeros((50, 2))
     assert np.abs(matched_shift_px((speed[0], still), (speed[1], still))).max() < 1e-5
 
 
-def test_the_pictures_may_change_places() -> None:
-    """e is odd: back is the opposite of forth."""
+def test_the_bias_changes_its_sign_with_the_order() -> None:
+    """The error is odd: exchanging the pictures reverses it."""
     rng = np.random.default_rng(2)
     speed, bend = rng.normal(0, 3, (2, 50, 2)), rng.normal(0, 0.3, (2, 50, 2))
     forth = matched_shift_px((speed[0], bend[0]), (speed[1], bend[1]))
@@ -39,7 +39,7 @@ def test_the_pictures_may_change_places() -> None:
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_steps_of_blurred_points_are_too_short_as_predicted(seed: int) -> None:
-    """What tracked steps lack in proportion to the step and to what acceleration does: most of both is predicted."""
+    """The errors proportional to the step and to the acceleration are mostly predicted."""
     rng = np.random.default_rng(seed)
     texture, error, predicted, steps, bends = _letters(rng), [], [], [], []
     for _ in range(PAIRS):
@@ -62,7 +62,7 @@ def test_steps_of_blurred_points_are_too_short_as_predicted(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_a_guide_that_blurs_the_sharper_picture_leaves_less_bias(seed: int) -> None:
-    """The errors of guided points are those predicted with the added blur, and smaller than those without."""
+    """The errors of guided points match the prediction with the added blur and not the one without."""
     rng = np.random.default_rng(seed)
     texture, error, predicted, unguided = _letters(rng), [], [], []
     for _ in range(PAIRS):
@@ -84,7 +84,7 @@ def test_a_guide_that_blurs_the_sharper_picture_leaves_less_bias(seed: int) -> N
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_pictures_blurred_along_each_other_s_paths_have_no_bias(seed: int) -> None:
-    """Neither in proportion to the step nor to what acceleration does; without even blur both are plain to see."""
+    """The errors proportional to step and acceleration nearly vanish; without this blur both are clear."""
     rng = np.random.default_rng(seed)
     texture, shifts, steps, bends = _letters(rng), ([], []), [], []
     for _ in range(PAIRS):
@@ -106,7 +106,7 @@ def test_pictures_blurred_along_each_other_s_paths_have_no_bias(seed: int) -> No
 
 
 class _EvenGuide:
-    """Knows the step between two pictures and their blur paths."""
+    """A guide that knows the step between two pictures and their blur paths."""
 
     def __init__(self, step: Array, first: Array, second: Array) -> None:
         self.step, self.paths = step, (first, second)
@@ -126,7 +126,7 @@ def _moved(step: Array, shape: tuple[int, int]) -> MapBetween:
 
 
 class _Guide:
-    """Knows the step between two pictures and the covariances of their blur."""
+    """A guide that knows the step between two pictures and the covariances of their blur."""
 
     def __init__(self, step: Array, first: Array = STILL, second: Array = STILL) -> None:
         self.step, self.lacks = step, (applied_blur(second - first), applied_blur(first - second))
@@ -142,7 +142,7 @@ class _Guide:
 
 
 def _slopes(error: Array, steps: Array, bends: Array) -> Array:
-    """Parts (2,) of steps and of shifts by acceleration that errors are, by robust weights."""
+    """Parts (2,) of the step and of the shift by acceleration in the errors, from a robust fit."""
     distance = np.linalg.norm(error, axis=1)
     weight = np.repeat(1 / (1 + (distance / (2 * np.median(distance))) ** 2), 2)
     rows = np.stack([steps.ravel(), bends.ravel()], axis=-1)
@@ -150,7 +150,7 @@ def _slopes(error: Array, steps: Array, bends: Array) -> Array:
 
 
 def _hand(rng: np.random.Generator, frame_s: float = 1 / 30, exposure_s: float = 0.013) -> tuple[Array, Array, Array]:
-    """Paths (INSTANTS, 2) about two instants, and the step between those: 400 px/s rms between 0.5 and 12 Hz."""
+    """Paths (INSTANTS, 2) about two instants and the step between them: 400 px/s RMS between 0.5 Hz and 12 Hz."""
     frequency = np.exp(np.linspace(np.log(0.5), np.log(12), 30))
     speed = (frequency / 2) / (1 + frequency / 2) / (1 + (frequency / 8) ** 2) * rng.uniform(0.6, 1.4, (2, 30))
     speed *= 400 / np.sqrt((speed**2).sum() / 2)
@@ -165,14 +165,14 @@ def _hand(rng: np.random.Generator, frame_s: float = 1 / 30, exposure_s: float =
 
 
 def _speed_and_bend(path: Array) -> tuple[Array, Array]:
-    """Of p(u) = c + speed u + bend u², u from -1 to 1: (1, 2) each."""
+    """Speed and bend, (1, 2) each, of p(u) = c + speed u + bend u², u from −1 to 1."""
     u = 2 * (np.arange(INSTANTS) + 0.5) / INSTANTS - 1
     fitted = np.polynomial.polynomial.polyfit(u, path, 2)
     return fitted[1][None], fitted[2][None]
 
 
 def _letters(rng: np.random.Generator) -> Array:
-    """Upright bars, long and thin either way, over each other; linear light in [0, 1]."""
+    """Overlapping horizontal and vertical bars; linear light in [0, 1]."""
     picture = np.full((SIDE, SIDE), 0.6, np.float32)
     for _ in range(500):
         left, top = rng.integers(0, SIDE, 2)

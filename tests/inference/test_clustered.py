@@ -1,4 +1,4 @@
-"""Errors that residuals share: deviations hold where groups of them err together, and blocks count each once."""
+"""Correlated errors: deviations are right for groups with common errors, and time blocks count each error once."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from virest.inference.clustered import adjusted_sums, raised, scatter
 from virest.inference.time_blocks import even_blocks, halves, varied_blocks
 
 
-def test_the_deviation_of_a_mean_holds_where_groups_err_together() -> None:
-    """Twenty groups of ten that share half of their variance: 2.3 times the deviation of independent ones."""
+def test_the_deviation_of_a_mean_includes_common_errors_of_groups() -> None:
+    """Twenty groups of ten with half of the variance in common have 2.3 times the deviation of independent values."""
     rng = np.random.default_rng(5)
     group = np.repeat(np.arange(20), 10)
     drawn = rng.normal(size=(400, 20))[:, group] + rng.normal(size=(400, 200))
@@ -20,16 +20,16 @@ def test_the_deviation_of_a_mean_holds_where_groups_err_together() -> None:
     assert np.mean(told) > 2 * alone
 
 
-def test_a_sum_about_its_mean_does_not_see_what_all_groups_share() -> None:
-    """Groups that all pull alike scatter by nothing."""
+def test_scatter_about_the_mean_excludes_a_common_part() -> None:
+    """Groups with equal contributions have no scatter about their mean."""
     pull = np.ones((12, 2)) * (1.0, -2.0)
     group = np.repeat(np.arange(4), 3)
     np.testing.assert_allclose(scatter(pull, group, about_mean=True), 0.0, atol=1e-12)
     assert scatter(pull, group)[0, 0] > 1
 
 
-def test_variances_are_raised_to_the_least_and_correlations_stay() -> None:
-    """Also of many matrices at once, and where a difference of sums has no variance."""
+def test_variances_are_raised_to_a_minimum_and_correlations_kept() -> None:
+    """A stack of matrices is handled like each matrix, and negative variances rise to the minimum."""
     small = np.array([[1.0, 0.5], [0.5, 4.0]])
     least = np.diag([4.0, 1.0])
     np.testing.assert_allclose(raised(small, least), [[4.0, 1.0], [1.0, 4.0]])
@@ -38,8 +38,8 @@ def test_variances_are_raised_to_the_least_and_correlations_stay() -> None:
     np.testing.assert_allclose(both[1], least)
 
 
-def test_blocks_are_contiguous_and_halves_share_none() -> None:
-    """Even ones hold about as many numbers each, varied ones are as long as they say."""
+def test_blocks_are_contiguous_and_halves_are_disjoint() -> None:
+    """Even blocks hold about equal counts; varied blocks have the given lengths."""
     assert even_blocks(np.arange(10), 10, 4).tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3]
     block = varied_blocks(np.arange(12), (3, 5, 2))
     assert np.bincount(block).tolist() == [3, 5, 2, 2]
@@ -50,8 +50,8 @@ def test_blocks_are_contiguous_and_halves_share_none() -> None:
     assert np.array_equal(first, ~second)
 
 
-def test_a_group_that_determines_a_value_is_not_the_more_certain_for_it() -> None:
-    """One of six groups holds most of the information on a value; the plain scatter misses half of the variance."""
+def test_a_dominant_group_does_not_reduce_the_variance() -> None:
+    """One of six groups holds most of the information on a value; the plain scatter misses much of the variance."""
     rng = np.random.default_rng(7)
     group = np.repeat(np.arange(6), 20)
     rows = rng.normal(0, 1, (120, 2)) * np.stack([np.where(group == 2, 6.0, 1.0), np.ones(120)], axis=-1)

@@ -1,4 +1,4 @@
-"""The coarse search: far offsets, any axes, turns about one axis only, clocks of different rates, and what is told."""
+"""The coarse search: distant offsets, any axes, rotation about one axis, different clock rates, and its reports."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PLANAR_AXES = ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
 
 
 def unknowing(profile: CameraProfile, axes: np.ndarray) -> CameraProfile:
-    """The profile without its offset and bias, its axes as given."""
+    """The profile without its offset and bias, with the given axes."""
     return replace(
         profile, time_offset_s=None, gyro_bias_rad_s=(0.0, 0.0, 0.0), r_cam_imu=tuple(map(tuple, axes.tolist()))
     )
@@ -29,8 +29,8 @@ def apart_deg(first: np.ndarray, second: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("number", [0, 5, 9, 14, 22])
-def test_a_far_offset_is_found_with_any_axes(number: int) -> None:
-    """From tracked points: 0.45 s to a few milliseconds and the mounting to a degree or two, whatever was given."""
+def test_a_distant_offset_is_found_with_any_axes(number: int) -> None:
+    """From tracked points, an offset of 0.45 s is found within 6 ms and the mounting within 3°, for any given axes."""
     recording = recorded(LATE)
     given = unknowing(recording.profile, axis_maps()[number])
     found = align_coarsely(recording.observed.turns(given), recording.imu, given)
@@ -46,7 +46,7 @@ def test_a_far_offset_is_found_with_any_axes(number: int) -> None:
 
 
 def test_axes_that_fit_are_kept() -> None:
-    """A mounting known to five degrees stays as given; the fit that follows will see to the rest."""
+    """A mounting known to 5° is kept as given and refined by the subsequent fit."""
     recording = recorded(LATE)
     nearly = Rotation.from_rotvec([0.05, -0.06, 0.03]).as_matrix() @ recording.profile.rotation_cam_imu
     found = align_coarsely(recording.turns(), recording.imu, unknowing(recording.profile, nearly))
@@ -56,8 +56,8 @@ def test_axes_that_fit_are_kept() -> None:
     assert found.time_offset_s == pytest.approx(0.45, abs=0.006)
 
 
-def test_motion_is_what_changes_in_the_turns() -> None:
-    """The rms of the changing turns: about the rate times a frame, per axis, whatever steady pan lies beneath."""
+def test_motion_is_the_varying_part_of_the_rotation() -> None:
+    """The RMS of the rotation per frame excludes a steady pan."""
     recording = recorded(LATE)
     found = align_coarsely(recording.turns(), recording.imu, recording.profile)
     assert found is not None
@@ -71,13 +71,13 @@ def test_motion_is_what_changes_in_the_turns() -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2], ids=["yaw", "pitch", "roll"])
-def test_turns_about_one_axis_take_an_axis_map(axis: int) -> None:
-    """They determine no rotation; the map taken brings the axis that turns where it belongs; the offset is found."""
+def test_rotation_about_one_axis_selects_an_axis_map(axis: int) -> None:
+    """It does not determine all axes; the selected map assigns the rotating axis correctly, and the offset is found."""
     about = tuple(np.eye(3)[axis].tolist())
     setup = replace(LATE, frames=150, about=about, r_cam_imu=PLANAR_AXES)
     recording = recorded(setup)
     turned = np.eye(3)[2 - axis]
-    # the map that turns this axis upside down: the worst there is
+    # the map that reverses this axis is the worst one
     wrong = max(axis_maps(), key=lambda m: -float(turned @ m @ np.array(PLANAR_AXES).T @ turned))
     found = align_coarsely(recording.turns(), recording.imu, unknowing(recording.profile, wrong))
     assert found is not None
@@ -88,16 +88,16 @@ def test_turns_about_one_axis_take_an_axis_map(axis: int) -> None:
     assert found.explained > 0.97
 
 
-def test_a_strange_gyroscope_is_told_and_not_refused() -> None:
-    """Another hand's gyroscope explains little and its runner-up as much: for the caller to judge."""
+def test_a_foreign_gyroscope_is_reported_to_the_caller() -> None:
+    """Another recording's gyroscope explains little, hardly more than the second-best offset."""
     found = align_coarsely(recorded(LATE).turns(), recorded(replace(LATE, seed=22)).imu, recorded(LATE).profile)
     assert found is not None
     assert found.explained < 0.5
     assert found.explained - found.runner_up < 0.1
 
 
-def test_an_offset_beyond_the_search_lies_at_its_end() -> None:
-    """A search of ±0.4 s about nought for 0.45 s ends on the edge, or says that it found nothing good."""
+def test_an_offset_beyond_the_search_range_is_at_its_end() -> None:
+    """A search range too small for 0.45 s gives a result at its limit, marked as such."""
     recording = recorded(replace(LATE, rate_rad_s=0.3))
     given = unknowing(recording.profile, recording.profile.rotation_cam_imu)
     near = align_coarsely(recording.turns(), recording.imu, given, search_s=0.444)
@@ -108,8 +108,8 @@ def test_an_offset_beyond_the_search_lies_at_its_end() -> None:
     assert not inside.at_end
 
 
-def test_no_inertial_data_no_alignment() -> None:
-    """Stamps an hour away from the inertial data, or pictures that never turn, give nothing."""
+def test_without_inertial_data_there_is_no_alignment() -> None:
+    """Timestamps an hour away from the samples, or frames without rotation, give no result."""
     recording = recorded(LATE)
     assert align_coarsely(recording.turns(3600.0), recording.imu, recording.profile) is None
     still = replace(recording.turns(), vector_rad=np.zeros((59, 3)))
@@ -118,7 +118,7 @@ def test_no_inertial_data_no_alignment() -> None:
 
 @pytest.mark.parametrize("skew", [0.0, 0.0028])
 def test_clocks_of_different_rates_are_searched(skew: float) -> None:
-    """Over 14 s a skew of 2.8 in a thousand is found to the nearest step; equal rates stay equal."""
+    """Over 14 s, a skew of 0.0028 is found to the nearest step; equal rates stay equal."""
     recording = recorded(Setup(seed=23, time_offset_s=0.12, clock_skew=skew, frames=420))
     given = replace(recording.profile, clock_skew=0.0, time_offset_s=0.1)
     found = align_with_skew(recording.turns(), recording.imu, given, search_s=0.2)
@@ -130,7 +130,7 @@ def test_clocks_of_different_rates_are_searched(skew: float) -> None:
 
 
 def test_there_are_24_axis_maps() -> None:
-    """All proper, all different, entries −1, 0 and 1; the phone's usual mounting is among them."""
+    """All are different proper rotations with entries −1, 0 and 1; the usual mounting is among them."""
     maps = axis_maps()
     assert maps.shape == (24, 3, 3)
     assert len(np.unique(maps.reshape(24, 9), axis=0)) == 24

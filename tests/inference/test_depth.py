@@ -1,4 +1,4 @@
-"""Triangulated points against the wall that they lie on, and frames' planes against points laid out by hand."""
+"""Triangulated points compared with their wall, and planes of frames with synthetic points."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ ROUGH_PER_M = PLANE_PER_M * 1.1
 
 @lru_cache(maxsize=2)
 def stretch(relief_m: float) -> tuple[SwayingCamera, Stretch]:
-    """Align a swaying camera before a wall, smooth or not."""
+    """Align a swaying camera in front of a smooth or rough wall."""
     camera = SwayingCamera(Sway(seed=9, relief_m=relief_m, depth_m=1.5, sway_m=0.09))
     return camera, align(camera.observed, camera.imu, camera.profile).stretches[0]
 
 
 def test_triangulated_points_lie_on_the_wall_within_their_deviations() -> None:
-    """Eq 11 with each point's own row time: points leave the plane by what the tracking noise makes."""
+    """Eq 11 with each point's own row time: distances from the plane match the tracking noise."""
     _, found = stretch(0.0)
     points, plane = found.points, found.scene.plane_per_m[0]
     assert len(points) > 0.6 * len(found.table)
@@ -41,7 +41,7 @@ def test_triangulated_points_lie_on_the_wall_within_their_deviations() -> None:
 
 
 def test_relief_is_seen_in_the_points() -> None:
-    """Points before and behind the wall by 0.25 m are found there, not on the plane."""
+    """Points 0.25 m in front of and behind the wall are found there and not on the plane."""
     _, found = stretch(0.25)
     points, plane = found.points, found.scene.plane_per_m[0]
     clear = points.std_per_m < 0.03 * points.inverse_depth_per_m
@@ -51,7 +51,7 @@ def test_relief_is_seen_in_the_points() -> None:
 
 
 def laid_out(count: int, moving: float = 0.0, noise: float = 0.004, seed: int = 2) -> TriangulatedPoints:
-    """Points on PLANE_PER_M seen from CENTRE_M by a camera turned by TURN; some belong to something else."""
+    """Points on PLANE_PER_M seen from CENTRE_M by a camera rotated by TURN; some belong to another object."""
     rng = np.random.default_rng(seed)
     rays = LENS.rays(rng.uniform((0, 0), (639, 479), (count, 2)), np.zeros(count))
     inverse = rays @ PLANE_PER_M + rng.normal(0, noise, count)
@@ -66,8 +66,8 @@ def depth_of(points: TriangulatedPoints, spread: float = 0.0, relative_std: floa
     return frame_depth(points, window, 5.0, TURN, CENTRE_M, LENS, ROUGH_PER_M, spread, relative_std)
 
 
-def test_a_frames_plane_goes_through_its_points() -> None:
-    """Even though a fifth of them belong to something nearer; the depth is that of the picture's middle."""
+def test_a_frame_s_plane_fits_its_points() -> None:
+    """A fifth of the points belong to a nearer object; the depth is that of the frame's centre."""
     found = depth_of(laid_out(300, moving=0.2), spread=0.02)
     np.testing.assert_allclose(found.plane_per_m, PLANE_PER_M, rtol=0.04, atol=0.004)
     middle = np.array([(319.5 - 310) / 500, (239.5 - 236) / 500, 1.0])
@@ -76,8 +76,8 @@ def test_a_frames_plane_goes_through_its_points() -> None:
     assert found.reason == ""
 
 
-def test_the_deviation_holds() -> None:
-    """Over many draws of the noise, with a scale that is known."""
+def test_the_deviation_of_a_depth_is_right() -> None:
+    """It matches the errors over many draws of the noise, and the scale's deviation is added to it."""
     middle = LENS.rays(np.array([319.5, 239.5]), 5.0)
     truth = 1 / (PLANE_PER_M @ middle)
     found = [depth_of(laid_out(60, noise=0.03, seed=k), spread=0.2) for k in range(60)]
@@ -87,8 +87,8 @@ def test_the_deviation_holds() -> None:
     assert with_scale.std_m**2 - without_scale.std_m**2 == pytest.approx((0.05 * truth) ** 2, rel=0.02)
 
 
-def test_too_few_points_leave_the_windows_plane_and_say_so() -> None:
-    """Points of another window, or of another time, do not count."""
+def test_too_few_points_keep_the_window_s_plane() -> None:
+    """Points of another window or time do not count, and a reason is given."""
     points = laid_out(300)
     late = TriangulatedPoints(
         points.window, points.place_m, points.time_s + 3, points.inverse_depth_per_m, points.std_per_m

@@ -1,4 +1,4 @@
-"""The one descent: outliers, priors, bounds, limits, damping, and slopes that were taken near by."""
+"""The shared descent: outliers, priors, bounds, limits, damping, and reused derivatives."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ ANY = np.full(3, np.inf)
 
 
 def decay(values: Array) -> Array:
-    """A falling exponential on a base."""
+    """A decaying exponential with a base."""
     return np.asarray(values[0] * np.exp(-values[1] * ABSCISSA) + values[2])
 
 
 @dataclass(frozen=True)
 class Look:
-    """A prediction, with slopes from some values."""
+    """A prediction with derivatives taken at other values."""
 
     seen: Array
     slope: Array
@@ -36,7 +36,7 @@ class Look:
     taken: Array
 
     def is_stale(self, limit: Slopes) -> bool:
-        """On the way slopes may be a tenth off."""
+        """Derivatives may be 0.1 off on the way."""
         far = {Slopes.ON_THE_WAY: 0.1, Slopes.AT_THE_END: 0.01, Slopes.HERE: 0.0}[limit]
         return bool(np.abs(self.values - self.taken).max() > far)
 
@@ -56,7 +56,7 @@ class Curve:
     seen: list[Array] = field(default_factory=list)
 
     def look(self, state: Array, before: Look | None, limit: Slopes) -> Look:
-        """Slopes of an earlier look serve while they are near."""
+        """Reuse the derivatives of an earlier look while they are close enough."""
         self.seen.append(state)
         here = self.predict(state)
         if before is not None and not (kept := Look(here, before.slope, state, before.taken)).is_stale(limit):
@@ -66,7 +66,7 @@ class Curve:
         return Look(here, slope, state, state)
 
     def weighed(self, state: Array, look: Look) -> System[Array, Look]:
-        """By one known deviation."""
+        """Weight by one known deviation."""
         rows, left = look.slope[:, None] / self.std, (self.measured - look.seen)[:, None] / self.std
         low, high = self.bounds
         return System(
@@ -75,20 +75,20 @@ class Curve:
         )  # fmt: skip
 
     def moved(self, state: Array, step: Array) -> Array:
-        """After a step."""
+        """The state after a step."""
         return state + step
 
 
 @pytest.fixture
 def curve(rng: np.random.Generator) -> Curve:
-    """A decay with noise, a tenth of it lost."""
+    """A decay with noise and 10 % outliers."""
     measured = decay(TRUE) + 0.05 * rng.normal(size=len(ABSCISSA))
     measured[::10] += rng.uniform(1, 4, len(measured[::10]))
     return Curve(measured)
 
 
-def test_the_least_loss_is_found_among_lost_points(curve: Curve) -> None:
-    """The values are those that a general minimiser finds for the same loss, and the truth is within deviations."""
+def test_the_minimum_is_found_despite_outliers(curve: Curve) -> None:
+    """The values equal those of a general minimiser for the same loss, and the truth lies within their deviations."""
     found = descend(curve, curve.start)
     soft = least_squares(
         lambda v: (curve.measured - decay(v)) / curve.std, TRUE, loss="cauchy", f_scale=CAUCHY, xtol=1e-12, ftol=1e-12
@@ -99,15 +99,15 @@ def test_the_least_loss_is_found_among_lost_points(curve: Curve) -> None:
     assert found.cost(1.0) == pytest.approx(soft.cost, rel=1e-4)
 
 
-def test_slopes_near_by_serve(curve: Curve) -> None:
-    """Fewer slopes than looks, and those at the end are taken near it."""
+def test_nearby_derivatives_are_reused(curve: Curve) -> None:
+    """There are fewer derivatives than looks, and the last ones are taken near the end."""
     found = descend(curve, curve.start)
     assert len(curve.taken) < len(curve.seen)
     assert not found.look.is_stale(Slopes.AT_THE_END)
 
 
-def test_slopes_are_stale_once_the_prediction_has_moved(rng: np.random.Generator) -> None:
-    """By a part of what is left, whatever its unit; taken where they serve they never are."""
+def test_derivatives_are_stale_once_the_prediction_has_moved(rng: np.random.Generator) -> None:
+    """The limit is a part of the residual, whatever its unit; derivatives at the same point are never stale."""
     for unit in (1.0, 1e-3):
         left = unit * rng.normal(size=500)
         slope = np.ones((500, 1))
@@ -119,14 +119,14 @@ def test_slopes_are_stale_once_the_prediction_has_moved(rng: np.random.Generator
 
 
 def test_a_step_that_does_not_lower_the_loss_is_damped() -> None:
-    """An arc tangent whose full step from far away leads ever farther off."""
+    """A full Newton step for an arc tangent diverges from a distant start."""
     bent = Curve(np.zeros(1), lambda values: np.arctan(values[:1]), start=np.array([3.0]), prior=np.zeros(1))
     found = descend(replace(bent, bounds=(-ANY[:1], ANY[:1])), np.array([3.0]))
     assert abs(found.state[0]) < 1e-3
 
 
-def test_a_value_at_its_bound_stays_and_the_others_go_on(curve: Curve) -> None:
-    """A base that may not exceed 0.3: the rest is the best beside that, its slopes one-sided."""
+def test_a_value_at_its_bound_stays_while_others_are_fitted(curve: Curve) -> None:
+    """With the base limited to 0.3, the other values are optimal; derivatives are one-sided at the bound."""
     bounded = replace(curve, bounds=(-ANY, np.array([np.inf, np.inf, 0.3])))
     found = descend(bounded, np.array([1.0, 1.0, 0.3]))
     assert found.state[2] == 0.3
@@ -138,8 +138,8 @@ def test_a_value_at_its_bound_stays_and_the_others_go_on(curve: Curve) -> None:
     assert all((values <= bounded.bounds[1]).all() for values in bounded.seen)
 
 
-def test_priors_hold_what_the_points_leave_open(curve: Curve) -> None:
-    """A strong prior keeps a value where it was; a step is no longer than its limit."""
+def test_priors_and_step_limits_apply(curve: Curve) -> None:
+    """A strong prior keeps a value at its start; no step exceeds its limit."""
     held = replace(curve, prior=np.array([0.0, 0.0, 1e8]))
     assert descend(held, curve.start).state[2] == pytest.approx(1.0, abs=1e-3)
     short = replace(curve, limit=0.1, seen=[])
@@ -147,8 +147,8 @@ def test_priors_hold_what_the_points_leave_open(curve: Curve) -> None:
     assert np.abs(np.diff(short.seen, axis=0)).max() <= 0.1 + 1e-12
 
 
-def test_nothing_to_fit_is_a_system_too(curve: Curve) -> None:
-    """Without values the residuals come back as they are."""
+def test_a_system_without_values_is_valid(curve: Curve) -> None:
+    """The residuals are returned unchanged."""
     fixed = Curve(
         curve.measured, lambda _: decay(TRUE), prior=np.zeros(0), start=np.zeros(0), bounds=(ANY[:0], ANY[:0])
     )
@@ -157,8 +157,8 @@ def test_nothing_to_fit_is_a_system_too(curve: Curve) -> None:
     np.testing.assert_allclose(descend(fixed, np.zeros(0), look=weighed.look).left, weighed.left)
 
 
-def test_the_score_is_what_residuals_pull(curve: Curve) -> None:
-    """Summed over the residuals, the slope of the loss."""
+def test_the_score_is_the_gradient_of_the_loss(curve: Curve) -> None:
+    """Its sum over the residuals equals the difference quotient."""
     found = descend(curve, curve.start, 1)
     np.testing.assert_allclose(found.pull(found.left), found.score.sum(axis=0), rtol=1e-9)
     fresh, step = curve.weighed(found.state, curve.look(found.state, None, Slopes.HERE)), 1e-6
@@ -170,14 +170,14 @@ def test_the_score_is_what_residuals_pull(curve: Curve) -> None:
         assert (behind - ahead) / (2 * step) == pytest.approx(fresh.score.sum(axis=0)[k], rel=1e-4, abs=1e-3)
 
 
-def test_values_one_after_another_lie_in_slices() -> None:
-    """Of lengths, none included."""
+def test_slices_follow_the_lengths() -> None:
+    """Zero lengths and empty lists are allowed."""
     assert slices([2, 0, 3]) == [slice(0, 2), slice(2, 2), slice(2, 5)]
     assert slices([]) == []
 
 
 def test_there_is_one_descent() -> None:
-    """Marquardt's damping stands in one file, but for the step fitted to thousands of profiles at once."""
+    """Marquardt's damping appears in one file only."""
     root = Path(virest.__file__).parent
     damped = {
         path.name

@@ -1,4 +1,4 @@
-"""Fits that begin at one profile and motion: what they share is computed once, and stays in its process."""
+"""Fits that start at the same profile and motion share cached values within a process."""
 
 import pickle
 
@@ -12,8 +12,8 @@ from virest.inference.track_fit import fit_from, fit_tracks
 SETUP = Setup(seed=5, frames=21, points=40, velocity_m_s=(0.0, 0.0, 0.0), rate_rad_s=1.2, noise_px=0.1)
 
 
-def test_fits_that_share_a_start_end_as_those_that_do_not() -> None:
-    """Whatever was fitted before from the same start."""
+def test_fits_with_a_shared_start_give_the_same_result() -> None:
+    """Earlier fits from the same start have no influence."""
     recording = Recording(SETUP)
     table = recording.observed.table(400)
     start = FitStart(recording.imu, table, recording.profile)
@@ -23,8 +23,8 @@ def test_fits_that_share_a_start_end_as_those_that_do_not() -> None:
         np.testing.assert_allclose(shared.difference_px, alone.difference_px, atol=1e-12)
 
 
-def test_what_is_shared_does_not_follow_into_another_process() -> None:
-    """It is found by the identity of objects, which is another one there."""
+def test_cached_values_are_not_sent_to_another_process() -> None:
+    """They are found by object identity, which differs there."""
     recording = Recording(SETUP)
     start = FitStart(recording.imu, recording.observed.table(400), recording.profile)
     fresh = len(pickle.dumps(start))

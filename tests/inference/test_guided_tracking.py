@@ -1,4 +1,4 @@
-"""Points looked for where the gyroscope puts them: where that helps, and where it must not."""
+"""Tracking guided by the gyroscope: its benefit, and cases where the guide must not be used."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from virest.restoration.settings import PRESETS
 
 Array = NDArray[np.float64]
 SQUARE_PX, FAST_RAD_S = 40, 2.0
-"""The picture moves by a square and more from frame to frame (median 43 px)."""
+"""The content moves by more than a square per frame (median 43 px)."""
 
 
 @pytest.fixture(scope="module")
 def board() -> Recording:
-    """A chessboard, shaken."""
+    """A shaken chessboard."""
     return shaken(chessboard(SQUARE_PX), FAST_RAD_S)
 
 
 @pytest.fixture(scope="module")
 def wall() -> Recording:
-    """Texture that repeats nowhere, shaken as much."""
+    """Texture without repetition, shaken as much."""
     return shaken(blobs(), FAST_RAD_S)
 
 
 def off_px(recording: Recording, pairs: list[TrackPair]) -> Array:
-    """How far points (n,) lie from where the true motion puts them."""
+    """Distances (n,) of points from their true positions."""
     stamp_s = np.array([frame.time_s for frame in recording.capture.frames])
     exposure_s = np.full(len(stamp_s), recording.phone.exposure_s)
     table = track_table(pairs, stamp_s, exposure_s, np.ones(len(pairs)))
@@ -47,13 +47,13 @@ def off_px(recording: Recording, pairs: list[TrackPair]) -> Array:
 
 
 def followed(recording: Recording, profile: CameraProfile | None = None) -> list[TrackPair]:
-    """Points with the gyroscope as a guide."""
+    """Points tracked with the gyroscope as a guide."""
     guide = gyro_guide(recording.capture, profile or recording.phone.profile)
     return track_pairs(recording.gray(recording.frames), guide=guide)
 
 
 def strange_logs(recording: Recording) -> dict[str, Array]:
-    """Logs that have nothing to do with the pictures."""
+    """Gyroscope logs unrelated to the frames."""
     own, rng = recording.capture.imu.gyro_rad_s, np.random.default_rng(1)
     time_s = recording.capture.imu.time_s
     others = {f"other {k}": hand_motion(100 + k, FAST_RAD_S).rate(time_s) @ np.array(R_CAM_IMU) for k in range(3)}
@@ -63,12 +63,15 @@ def strange_logs(recording: Recording) -> dict[str, Array]:
     return {"reversed": own[::-1], "shuffled": rng.permutation(own), "pieces": np.concatenate(pieces), **others}
 
 
-# ── where it helps ───────────────────────────────────────────────────────────────────────────────────────────────
+# ── benefits ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("drawing", [chessboard(SQUARE_PX), chessboard(12), grating(24)], ids=["40", "12", "waves"])
-def test_texture_that_repeats_is_followed(drawing: NDArray[np.uint8]) -> None:
-    """Squares and waves jump by several periods a frame: without the guide most points are taken for their likes."""
+def test_repeating_texture_is_tracked(drawing: NDArray[np.uint8]) -> None:
+    """Squares and waves move by several periods per frame.
+
+    Without the guide most points are matched to a neighbouring period.
+    """
     recording = shaken(drawing, FAST_RAD_S, frames=10)
     assert find_guide(recording.capture, recording.phone.profile, recording.gray, recording.frames) is not None
     off = off_px(recording, followed(recording))
@@ -78,8 +81,8 @@ def test_texture_that_repeats_is_followed(drawing: NDArray[np.uint8]) -> None:
     assert (off_px(recording, track_pairs(recording.gray(recording.frames))) > 3).mean() > 0.5
 
 
-def test_a_fast_pan_before_a_chessboard_is_followed() -> None:
-    """A turn of 4 rad/s, 60 to 100 px a frame, is nearly the same in every frame and in many an axis map."""
+def test_a_fast_pan_over_a_chessboard_is_tracked() -> None:
+    """A rotation at 4 rad/s, 60 px to 100 px per frame, is similar in every frame and for many axis maps."""
     recording = Phone(chessboard(SQUARE_PX), hand_motion(3, 1.0, pan_rad_s=(0.0, 4.0, 0.0)), frames=10).record()
     guide = find_guide(recording.capture, recording.phone.profile, recording.gray, recording.frames)
     assert guide is not None
@@ -87,8 +90,8 @@ def test_a_fast_pan_before_a_chessboard_is_followed() -> None:
     assert (off > 3).mean() < 0.02
 
 
-def test_an_unknown_offset_and_strange_axes_are_found(board: Recording) -> None:
-    """The log is 0.3 s late, its axes are interchanged, and the profile knows neither: the pictures tell both."""
+def test_an_unknown_offset_and_permuted_axes_are_found(board: Recording) -> None:
+    """The log is 0.3 s late with permuted axes, and the profile knows neither; the frames determine both."""
     turn = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
     late = np.roll(board.capture.imu.gyro_rad_s @ turn.T, 60, axis=0)
     profile = replace(board.phone.profile, time_offset_s=None)
@@ -99,8 +102,8 @@ def test_an_unknown_offset_and_strange_axes_are_found(board: Recording) -> None:
     assert np.allclose(found.rotation_cam_imu, np.array(R_CAM_IMU) @ turn.T)
 
 
-def test_fast_and_blurred_pictures_keep_their_points() -> None:
-    """250 px a frame of 1080p and 30 px of blur, a quarter as large: 60 % of what is kept at a tenth of it."""
+def test_fast_and_blurred_frames_keep_their_points() -> None:
+    """At motion of more than 55 px per frame, more than 60 % as many points are kept as at a tenth of the motion."""
     drawing = blobs()
     fast, slow = (shaken(drawing, 3.3 * part, instants=8, frames=8) for part in (1.0, 0.1))
     moved = np.concatenate([pair.points_second_px - pair.points_first_px for pair in followed(fast)])
@@ -109,8 +112,8 @@ def test_fast_and_blurred_pictures_keep_their_points() -> None:
     assert (kept[0] < 1).sum() > 0.6 * (kept[1] < 1).sum()
 
 
-def test_noise_is_no_larger(wall: Recording) -> None:
-    """Guided points lie at least as near to where they belong as unguided ones."""
+def test_guided_tracking_has_no_more_noise(wall: Recording) -> None:
+    """Guided points are at least as accurate and as numerous as unguided ones."""
     plain, guided = off_px(wall, track_pairs(wall.gray(wall.frames))), off_px(wall, followed(wall))
     assert len(guided) >= len(plain)
     assert np.median(guided) <= np.median(plain)
@@ -118,7 +121,7 @@ def test_noise_is_no_larger(wall: Recording) -> None:
 
 @pytest.mark.scenario
 def test_a_shaken_chessboard_is_restored(board: Recording) -> None:
-    """Planned and restored as `process` does: refused whole without the guide, some 10 dB better with it."""
+    """Planned and restored as by ``process``, frames improve by more than 5 dB."""
     plan = plan_restoration(board.capture, board.phone.profile, PRESETS["fast"], board.gray)
     assert plan.copy_reason is None
     chosen = [3, 6, 9]
@@ -132,11 +135,11 @@ def test_a_shaken_chessboard_is_restored(board: Recording) -> None:
         assert 10 * np.log10(before / after) > 5, number
 
 
-# ── what it must not do ──────────────────────────────────────────────────────────────────────────────────────────
+# ── limits ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_strange_log_guides_nobody(board: Recording, wall: Recording) -> None:
-    """Reversed, shuffled, cut into pieces, or of other recordings: no guide, whatever the pictures show."""
+def test_an_unrelated_log_gives_no_guide(board: Recording, wall: Recording) -> None:
+    """Reversed, shuffled or cut logs, and those of other recordings, give no guide for any content."""
     for recording in (board, wall):
         for name, log in strange_logs(recording).items():
             for offset_s in (0.0, None):
@@ -145,16 +148,16 @@ def test_a_strange_log_guides_nobody(board: Recording, wall: Recording) -> None:
                 assert find_guide(strange.capture, profile, recording.gray, recording.frames) is None, name
 
 
-def test_a_strange_log_is_refused(board: Recording) -> None:
-    """A chessboard beside another recording's log is copied."""
+def test_an_unrelated_log_is_refused(board: Recording) -> None:
+    """A chessboard with another recording's log is copied."""
     strange = board.with_log(strange_logs(board)["other 0"])
     plan = plan_restoration(strange.capture, board.phone.profile, PRESETS["fast"], board.gray)
     assert plan.copy_reason is not None
     assert "disagree" in plan.copy_reason
 
 
-def test_a_still_camera_beside_a_moving_log_is_refused(board: Recording) -> None:
-    """A phone at rest before a chessboard, and the log of one that moves."""
+def test_a_still_camera_with_a_moving_log_is_refused(board: Recording) -> None:
+    """A phone at rest films a chessboard, and the log belongs to a moving phone."""
     rest = replace(shaken(chessboard(SQUARE_PX), 0.0, instants=1), capture=board.capture)
     for offset_s in (None, 0.0):
         profile = replace(board.phone.profile, time_offset_s=offset_s)
@@ -164,7 +167,7 @@ def test_a_still_camera_beside_a_moving_log_is_refused(board: Recording) -> None
 
 
 def test_a_wrong_profile_does_not_pull_points(wall: Recording) -> None:
-    """Of what the guide is wrong by, less than 3 % is found in the points: they go where the pictures show them."""
+    """Less than 3 % of the guide's error appears in the points, which follow the frames."""
     lens = wall.phone.profile.intrinsics
     assert lens is not None
     wrong = replace(wall.phone.profile, time_offset_s=0.006, intrinsics=lens.scaled_focal(1.04))
@@ -182,14 +185,14 @@ def test_a_wrong_profile_does_not_pull_points(wall: Recording) -> None:
 
 
 def put_by(recording: Recording, profile: CameraProfile, pair: TrackPair) -> Array:
-    """Where a profile puts a pair's points (n, 2) in the second frame."""
+    """Positions of a pair's points (n, 2) in the second frame, as predicted by a profile."""
     stamp_s = np.array([frame.time_s for frame in recording.capture.frames])
     table = track_table([pair], stamp_s, np.full(len(stamp_s), recording.phone.exposure_s), np.ones(1))
     return predict(integrate_motion(recording.capture.imu, profile, translation=False), table, None).second_px
 
 
-def test_what_goes_its_own_way_is_still_followed(wall: Recording) -> None:
-    """A dashboard in the lower third stands still in the pictures: its points do too."""
+def test_independently_moving_parts_are_still_tracked(wall: Recording) -> None:
+    """A dashboard in the lower third is static in the frames, and so are its points."""
     edge, dashboard = 240, blobs(seed=9)[:120, :480]
     pictures = [np.concatenate([picture[:edge], dashboard]) for picture in wall.pictures]
     driving = replace(wall, pictures=pictures)
@@ -205,8 +208,8 @@ def test_what_goes_its_own_way_is_still_followed(wall: Recording) -> None:
 # ── the map ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_the_map_is_the_forward_model(wall: Recording) -> None:
-    """Its polynomials give what track_model predicts to 0.01 px, and its inverse leads back."""
+def test_the_map_matches_the_forward_model(wall: Recording) -> None:
+    """Its polynomials match the prediction within 0.01 px, and its inverse leads back."""
     guide = gyro_guide(wall.capture, wall.phone.profile)
     between = guide.seen_before(4, 5, (wall.phone.height, wall.phone.width), 1)
     assert between is not None

@@ -1,4 +1,4 @@
-"""From tracked pairs to a table: what is kept, what is left out, windows, thinning, and the pictures' turns."""
+"""From tracked pairs to a table: selection, windows, thinning, and rotations of frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HAND = Setup(seed=51, frames=30, points=80)
 
 
 def with_pairs(pairs: list[TrackPair], stamp_s: np.ndarray) -> ObservedTracks:
-    """Tracks of which only the stamps matter."""
+    """Tracks in which only the timestamps matter."""
     return replace(
         recorded(HAND).observed,
         pairs=tuple(pairs),
@@ -30,13 +30,13 @@ def with_pairs(pairs: list[TrackPair], stamp_s: np.ndarray) -> ObservedTracks:
 
 
 def some_pairs(frames: list[int], points: int = 20) -> list[TrackPair]:
-    """Pairs beginning at these frames, with points anywhere."""
+    """Pairs that start at these frames, with arbitrary points."""
     rng = np.random.default_rng(3)
     return [TrackPair(k, k + 1, rng.uniform(0, 470, (points, 2)), rng.uniform(0, 470, (points, 2))) for k in frames]
 
 
-def test_turns_of_the_pictures_are_the_cameras() -> None:
-    """From points: each rotation to what noise allows, at the middle of readout and exposure on the camera's clock."""
+def test_frame_rotations_match_the_camera() -> None:
+    """Rotations from points are right within the noise, at the middle of readout and exposure on the camera's clock."""
     setup = replace(HAND, readout_direction="top_to_bottom", readout_time_s=0.004, timestamp="exposure_end")
     recording = recorded(setup)
     found, truth = recording.observed.turns(recording.profile), recording.turns()
@@ -46,8 +46,11 @@ def test_turns_of_the_pictures_are_the_cameras() -> None:
     assert np.abs(truth.vector_rad).max() > 0.03
 
 
-def test_parts_that_go_their_own_way_are_left_out() -> None:
-    """A dashboard over the lowest quarter goes; what lies far off elsewhere, and everything if all does, stays."""
+def test_independently_moving_parts_are_left_out() -> None:
+    """A dashboard in the lowest quarter is removed.
+
+    Isolated outliers stay, and so does everything if most points disagree.
+    """
     observed = recorded(HAND).observed
     table = observed.table(10**6)
     dashboard = table.first_px[:, 1] > 480
@@ -68,8 +71,8 @@ def test_parts_that_go_their_own_way_are_left_out() -> None:
     assert observed.without_astray(table.first_px, most)[1] == 0.0
 
 
-def test_a_pair_left_with_too_few_points_goes() -> None:
-    """Where a part is left out, pairs that keep fewer than MIN_TRACKS points go with it, noise and all."""
+def test_a_pair_left_with_too_few_points_is_removed() -> None:
+    """Pairs that keep fewer than MIN_TRACKS points are removed with their noise."""
     rng = np.random.default_rng(4)
     pairs = []
     for k in range(12):
@@ -85,7 +88,7 @@ def test_a_pair_left_with_too_few_points_goes() -> None:
 
 
 def test_a_long_capture_has_windows_of_a_few_seconds() -> None:
-    """Eight seconds, a pause of three, two seconds more: equal windows, none across the pause, none too long."""
+    """8 s, a pause of 3 s and 2 s more give equal windows, none across the pause and none too long."""
     stamp_s = np.concatenate([np.arange(240) / 30, 11 + np.arange(61) / 30])
     frames = [k for k in range(300) if k != 239]
     table = with_pairs(some_pairs(frames, 3), stamp_s).table(10**6)
@@ -102,8 +105,8 @@ def test_a_long_capture_has_windows_of_a_few_seconds() -> None:
         assert table.first_stamp_s[inside].min() < table.origin_s[window] < table.second_stamp_s[inside].max()
 
 
-def test_pairs_outside_the_inertial_data_or_over_a_pause_go() -> None:
-    """Both pictures must lie inside, offset included, and no hole of the inertial data between them."""
+def test_pairs_outside_the_inertial_data_or_over_a_gap_are_removed() -> None:
+    """Both frames must lie inside the samples, with the offset applied, and no gap may lie between them."""
     recording = recorded(replace(HAND, time_offset_s=0.25))
     imu = recording.imu
     whole = recording.observed.covered(imu, recording.profile)
@@ -122,7 +125,7 @@ def test_pairs_outside_the_inertial_data_or_over_a_pause_go() -> None:
 
 
 def test_a_table_is_thinned_evenly() -> None:
-    """About as many points as asked for, from every pair, and the same points of both frames."""
+    """About the requested number of points remains, from every pair, the same in both frames."""
     observed = recorded(HAND).observed
     table = observed.table(500)
     assert 400 < len(table) <= 500 + 29
@@ -135,14 +138,17 @@ def test_a_table_is_thinned_evenly() -> None:
 
 
 def capture(stamps_s: list[float], exposures_s: list[float | None]) -> Capture:
-    """A recording of which only the frames matter."""
+    """A recording in which only the frames matter."""
     frames = tuple(Frame(k, 0, t, e) for k, (t, e) in enumerate(zip(stamps_s, exposures_s, strict=True)))
     imu = ImuSamples(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
     return Capture("c", Path("c"), Path("c"), 480, 640, frames, imu, CaptureMetadata(), "REALTIME", 0)
 
 
-def test_pairs_worth_something_are_kept() -> None:
-    """Too few points, or a frame without a stamp, and the pair goes; a missing exposure is the typical one."""
+def test_usable_pairs_are_kept() -> None:
+    """Pairs with too few points or a frame without timestamp are removed.
+
+    A missing exposure is replaced by the typical one.
+    """
     pairs = [*some_pairs([0, 1, 2, 3]), *some_pairs([4], MIN_TRACKS - 1), *some_pairs([5])]
     stamps = [0.0, 0.033, np.nan, 0.1, 0.133, 0.166, 0.2]
     found = observe_tracks(
@@ -156,8 +162,8 @@ def test_pairs_worth_something_are_kept() -> None:
     assert found.lens.fx_px == pytest.approx(512)
 
 
-def test_unknown_exposures_count_as_none() -> None:
-    """Where no frame has an exposure, all are nought, and that is told; a known lens is the profile's."""
+def test_unknown_exposures_count_as_zero() -> None:
+    """If no frame has an exposure, all are zero and marked as unknown; a known lens is the profile's."""
     profile = recorded(HAND).profile
     found = observe_tracks(capture([0.0, 0.03, 0.07], [None, None, None]), some_pairs([0, 1]), profile)
     assert not found.exposure_known

@@ -1,4 +1,4 @@
-"""Accelerometer noise, carried through the path and the fit to the values."""
+"""Accelerometer noise propagated through path and fit to the parameters."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def noisy(imu: ImuSamples, seed: int) -> ImuSamples:
     return replace(imu, accel_m_s2=imu.accel_m_s2 + noise)
 
 
-def test_the_noise_that_is_measured_moves_the_values_as_predicted() -> None:
-    """The scatter of the values over other draws of the noise; the whole drift would be several times that."""
+def test_accelerometer_noise_moves_parameters_as_predicted() -> None:
+    """The prediction matches the scatter over other draws of the noise, far below the complete drift."""
     recording = Recording(SWAYING)
     table, profile = recording.table(), recording.profile
     scene, imu = recording.scene(table), noisy(recording.imu, 0)

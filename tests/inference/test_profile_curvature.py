@@ -1,4 +1,4 @@
-"""Deviations of values from points across their parallax, where parallax is about as long as the tracking noise."""
+"""Deviations of parameters from points across their parallax, with parallax close to the tracking noise."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SWAYING = Setup(
 
 
 @pytest.mark.parametrize("sway_m", [0.02, 0.06])
-def test_deviations_hold_where_directions_are_uncertain(sway_m: float) -> None:
-    """Without an accelerometer; Gauss-Newton's deviations are exceeded twofold by one error in four."""
+def test_deviations_are_right_with_uncertain_directions(sway_m: float) -> None:
+    """Without an accelerometer, Gauss–Newton's deviations would be exceeded twofold by one error in four."""
     ratios = []
     for seed in range(320, 324):
         recording = Recording(replace(SWAYING, seed=seed, sway_m=sway_m))

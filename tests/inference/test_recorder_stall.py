@@ -1,4 +1,4 @@
-"""A stall in mid-movie: slots get the times of what they show where points tell, and stay left out elsewhere."""
+"""A stall in the middle of a movie: frames get the times of their content if points determine them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Recorded = tuple[Capture, CameraProfile, dict[int, NDArray[np.uint8]]]
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """Forty frames in a hand, with the pictures that each capture shows."""
+    """40 hand-held frames with the pictures of each captured frame."""
     folder = tmp_path_factory.mktemp("stall") / "trip"
     simulate_command(folder, width=200, height=280, frames=40, exposure_ms=6, rate_rad_s=1.2, seed=8,
                      truth_frames=False)  # fmt: skip
@@ -36,7 +36,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 
 def shown(slot: int) -> int:
-    """The capture that a slot shows: from JUMP on three later, used up by three repeats."""
+    """The captured frame that a slot shows: three later from JUMP, used up by three repeats."""
     return slot + (len(REPEATS) - sum(r <= slot for r in REPEATS) if JUMP <= slot <= STALLED[1] else 0)
 
 
@@ -49,8 +49,8 @@ def stalled(capture: Capture) -> Capture:
     return replace(capture, frames=frames, stalls=(STALLED,))
 
 
-def test_late_pictures_get_the_times_of_what_they_show(recorded: Recorded) -> None:
-    """The jump, which nothing but turns shows, and every slot after it; nothing bars them then."""
+def test_late_frames_get_the_times_of_their_content(recorded: Recorded) -> None:
+    """The jump, visible only in the rotation, and all later slots are found; then no frame is skipped."""
     capture, profile, pictures = recorded
     late = stalled(capture)
     seen = {k: pictures[shown(k)] for k in stall_window(late, STALLED)}
@@ -67,8 +67,8 @@ def test_late_pictures_get_the_times_of_what_they_show(recorded: Recorded) -> No
 
 
 @pytest.mark.parametrize("case", ["as stamped", "another lateness", "slow", "no clock"])
-def test_where_points_do_not_tell_nothing_is_taken(recorded: Recorded, case: str) -> None:
-    """Pictures at their stamps, pictures late by half a period, a phone that hardly turns, an unknown clock."""
+def test_without_evidence_no_stall_is_corrected(recorded: Recorded, case: str) -> None:
+    """Frames at their timestamps, frames late by half a period, a nearly still phone, and an unknown clock."""
     capture, profile, pictures = recorded
     late = stalled(capture)
     seen = {k: pictures[shown(k)] for k in stall_window(late, STALLED)}

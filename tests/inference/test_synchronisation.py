@@ -1,4 +1,4 @@
-"""Time offset and agreement: tracks made from an analytic motion, a small rendered capture, and measured ones."""
+"""Time offset and agreement, with tracks of an analytic motion and measured captures."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def agreement(recorded: Synthetic, time_offset_s: float) -> Agreement:
     return check_agreement(recorded.observed(profile), recorded.imu, profile)
 
 
-# ── what is found ────────────────────────────────────────────────────────────────────────────────────────────────
+# ── estimates ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("time_offset_s", [0.0, 0.013, -0.4])
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_offset_and_bias_come_back(time_offset_s: float, direction: str) -> None:
-    """For all readout directions and near or far offsets the offset returns to 0.1 ms, the bias to 1 mrad/s."""
+def test_offset_and_bias_are_recovered(time_offset_s: float, direction: str) -> None:
+    """For all readout directions and any offset, the offset is right within 0.1 ms and the bias within 1 mrad/s."""
     stamp = ("exposure_start", "exposure_middle", "exposure_end")[DIRECTIONS.index(direction) % 3]
     setup = Setup(
         hand_motion(DIRECTIONS.index(direction)),
@@ -62,8 +62,8 @@ def test_offset_and_bias_come_back(time_offset_s: float, direction: str) -> None
     assert not found.travels
 
 
-def test_a_gyroscope_mounted_another_way_is_named() -> None:
-    """Pictures and gyroscope belong together, but the profile's axes are another phone's: no recording is blamed."""
+def test_a_gyroscope_with_other_axes_is_reported() -> None:
+    """Frames and gyroscope belong together, but the profile has another phone's axes: the advice is to calibrate."""
     recorded = make(Setup(hand_motion(3), time_offset_s=0.011, frames=30, points=60))
     turned = np.array(recorded.profile.r_cam_imu)[[1, 0, 2]] * [[1], [-1], [1]]
     profile = replace(recorded.profile, time_offset_s=None, r_cam_imu=tuple(map(tuple, turned.tolist())))
@@ -77,8 +77,8 @@ def test_a_gyroscope_mounted_another_way_is_named() -> None:
 
 
 @pytest.mark.parametrize("error_s", [0.007, -0.012])
-def test_an_offset_a_little_wrong_agrees_but_not_best(error_s: float) -> None:
-    """Pictures and gyroscope belong together, and where they agree clearly better is told, coarsely."""
+def test_a_slightly_wrong_offset_agrees_and_a_better_one_is_named(error_s: float) -> None:
+    """Frames and gyroscope agree, and the better offset is reported coarsely."""
     recorded = make(Setup(hand_motion(2), time_offset_s=0.011, frames=30, points=60))
     right, wrong = agreement(recorded, 0.011), agreement(recorded, 0.011 + error_s)
     assert right.agrees
@@ -90,8 +90,10 @@ def test_an_offset_a_little_wrong_agrees_but_not_best(error_s: float) -> None:
 @pytest.mark.parametrize(
     ("velocity_m_s", "depth_m"), [((0.1, -0.1, 3.0), (5.0, 60.0)), ((0.2, 0.1, 0.0), (1.5, 12.0))], ids=["car", "sway"]
 )
-def test_parallax_is_told_from_rotation(velocity_m_s: tuple[float, float, float], depth_m: tuple[float, float]) -> None:
-    """A camera that also moves gives its offset within three standard deviations, and within half a millisecond."""
+def test_parallax_is_separated_from_rotation(
+    velocity_m_s: tuple[float, float, float], depth_m: tuple[float, float]
+) -> None:
+    """A camera that also moves gives its offset within three deviations and 0.5 ms."""
     for seed in range(3):
         motion = hand_motion(30 + seed, 0.25, velocity_m_s=velocity_m_s)
         setup = Setup(motion, time_offset_s=-0.005, depth_m=depth_m, points=100, seed=seed)
@@ -101,15 +103,15 @@ def test_parallax_is_told_from_rotation(velocity_m_s: tuple[float, float, float]
         assert abs(found.time_offset_s + 0.005) < min(3 * found.std_s, 5e-4)
 
 
-def test_moving_objects_are_outvoted() -> None:
-    """A quarter of the points on an object that moves by itself changes nothing."""
+def test_moving_objects_do_not_change_the_offset() -> None:
+    """A quarter of the points belong to a moving object."""
     found = estimate(Setup(hand_motion(6, 0.3), time_offset_s=-0.021, outliers=0.25))
     assert found.determined, found.reason
     assert abs(found.time_offset_s + 0.021) < 1.5e-4
 
 
 def test_errors_fit_their_standard_deviations() -> None:
-    """Over twelve recordings with few noisy points, errors divided by standard deviations stay sane."""
+    """Over twelve recordings with few noisy points, errors in standard deviations are plausible."""
     ratios = []
     for seed in range(12):
         found = estimate(
@@ -122,7 +124,10 @@ def test_errors_fit_their_standard_deviations() -> None:
 
 
 def test_wrong_readout_shows_in_the_standard_deviation() -> None:
-    """With a readout 6 % off, the middle row's time is right, and the deviation covers what the first row's is off."""
+    """With a readout time 6 % off, the middle row's time is right.
+
+    The deviation covers the error of the first row's time.
+    """
     setup = Setup(hand_motion(80, 0.3), readout_time_s=0.0207)
     recorded = make(setup)
     wrong = replace(recorded.profile, shutter=replace(recorded.profile.shutter, readout_time_s=0.022))
@@ -131,8 +136,8 @@ def test_wrong_readout_shows_in_the_standard_deviation() -> None:
     assert abs(found.time_offset_s) < 2 * found.std_s
 
 
-def test_unknown_readout_is_a_nuisance() -> None:
-    """An unknown readout is fitted beside the offset; the deviation says that only their sum is sure."""
+def test_an_unknown_readout_is_fitted_with_the_offset() -> None:
+    """The deviation accounts for the fact that only their sum is well determined."""
     setup = Setup(hand_motion(60, 0.3), time_offset_s=0.1)
     recorded = make(setup)
     unknown = replace(
@@ -147,7 +152,7 @@ def test_unknown_readout_is_a_nuisance() -> None:
 
 
 def test_unknown_focal_length_is_found_with_the_offset() -> None:
-    """Without intrinsics the motion gives the focal length to a percent, and the offset all the same."""
+    """Without intrinsics the motion gives the focal length within 1 %, and the offset within 1 ms."""
     recorded = make(Setup(hand_motion(71, 0.3), time_offset_s=0.1))
     unknown = replace(recorded.profile, intrinsics=None)
     found = estimate_time_offset(recorded.observed(unknown), recorded.imu, unknown)
@@ -158,7 +163,7 @@ def test_unknown_focal_length_is_found_with_the_offset() -> None:
 
 
 def test_a_stabiliser_is_not_taken_for_another_focal_length() -> None:
-    """It halves what the pictures turn by; the points do not follow such a lens, and no focal length is told."""
+    """It halves the rotation in the frames; the points do not follow such a lens, and no focal length is reported."""
     for fraction, told in ((0.0, True), (0.5, False)):
         recording = hand(replace(SWAYING, stabilised=(fraction, 1.0)))
         unknown = replace(recording.profile, intrinsics=None, time_offset_s=None, extensions=Extensions())
@@ -167,7 +172,7 @@ def test_a_stabiliser_is_not_taken_for_another_focal_length() -> None:
 
 
 def test_a_dashboard_is_left_out() -> None:
-    """Points of the lower quarter that rest in the picture do not move offset or focal length."""
+    """Static points in the lower quarter change neither offset nor focal length."""
     recorded = make(Setup(hand_motion(72, 0.3), time_offset_s=0.02, points=160))
     pairs = []
     for pair in recorded.pairs:
@@ -181,8 +186,8 @@ def test_a_dashboard_is_left_out() -> None:
     assert found.focal_px == pytest.approx(980.0, rel=0.005)
 
 
-def test_drifting_clock_is_named() -> None:
-    """A clock skew that the profile lacks is reported, and the deviation widens to hold the first stamp's offset."""
+def test_a_drifting_clock_is_reported() -> None:
+    """A clock skew missing from the profile is reported; the deviation widens to include the first frame's offset."""
     recorded = make(Setup(hand_motion(50, 0.3), time_offset_s=0.1, clock_skew=0.004, frames=60, points=50))
     given = replace(recorded.profile, clock_skew=0.0)
     found = estimate_time_offset(recorded.observed(), recorded.imu, given)
@@ -191,8 +196,8 @@ def test_drifting_clock_is_named() -> None:
     assert "drifts" in found.reason
 
 
-def test_half_a_second_shows_no_drift_by_chance() -> None:
-    """Points that lie off together imitate a drift in six of sixty short captures, by its deviation; here in one."""
+def test_a_short_capture_shows_no_drift_by_chance() -> None:
+    """Common errors of points imitate a drift in these short captures; at most one is reported."""
     drifts = 0
     for seed in (1, 26, 29, 31, 39, 48):
         recorded = make(
@@ -205,7 +210,7 @@ def test_half_a_second_shows_no_drift_by_chance() -> None:
     assert drifts <= 1
 
 
-# ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────
+# ── rejections ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize(
@@ -213,8 +218,8 @@ def test_half_a_second_shows_no_drift_by_chance() -> None:
     [(hand_motion(1, 0.0004), "hardly change"), (hand_motion(1, 1e-7, pan_rad_s=(0.1, 0.5, 0.05)), "hardly change")],
     ids=["still", "steady pan"],
 )
-def test_motion_that_tells_nothing_is_refused(motion: object, word: str) -> None:
-    """A still camera, and one that turns at a constant rate, look the same at every offset."""
+def test_uninformative_motion_is_refused(motion: object, word: str) -> None:
+    """A still camera and one that turns at a constant rate look the same at every offset."""
     recorded = make(Setup(motion, frames=20, points=40))  # type: ignore[arg-type]
     found = estimate_time_offset(recorded.observed(), recorded.imu, recorded.profile)
     assert not found.determined
@@ -226,25 +231,25 @@ def test_motion_that_tells_nothing_is_refused(motion: object, word: str) -> None
 
 
 def foreign(recorded: Synthetic, seed: int) -> ImuSamples:
-    """Make the gyroscope of another hand."""
+    """The gyroscope of another recording."""
     return replace(recorded.imu, gyro_rad_s=hand_motion(900 + seed).rate(recorded.imu.time_s) @ np.array(R_CAM_IMU))
 
 
 def shuffled(recorded: Synthetic, seed: int) -> ImuSamples:
-    """Cut the gyroscope's table into twelve pieces and mix them."""
+    """The gyroscope's table cut into twelve pieces in random order."""
     pieces = np.array_split(recorded.imu.gyro_rad_s, 12)
     order = np.random.default_rng(seed).permutation(12)
     return replace(recorded.imu, gyro_rad_s=np.concatenate([pieces[k] for k in order]))
 
 
 def backwards(recorded: Synthetic, seed: int) -> ImuSamples:
-    """Play the gyroscope's table backwards."""
+    """The gyroscope's table in reverse."""
     return replace(recorded.imu, gyro_rad_s=recorded.imu.gyro_rad_s[::-1])
 
 
 @pytest.mark.parametrize(("spoil", "frames"), [(foreign, 12), (foreign, 30), (backwards, 30)])
-def test_strange_gyroscopes_are_refused(spoil: Callable[[Synthetic, int], ImuSamples], frames: int) -> None:
-    """The gyroscope of another recording, or one played backwards, gives no offset and no agreement."""
+def test_unrelated_gyroscopes_are_refused(spoil: Callable[[Synthetic, int], ImuSamples], frames: int) -> None:
+    """A gyroscope of another recording or in reverse gives neither an offset nor agreement."""
     for seed in range(8):
         recorded = make(Setup(hand_motion(seed), frames=frames, points=25, seed=seed))
         recorded = replace(recorded, imu=spoil(recorded, seed))
@@ -254,8 +259,8 @@ def test_strange_gyroscopes_are_refused(spoil: Callable[[Synthetic, int], ImuSam
         assert not agreement(recorded, 0.0).agrees
 
 
-def test_shuffled_gyroscope_is_never_taken_at_a_wrong_offset() -> None:
-    """Pieces of the right recording in the wrong order: refused."""
+def test_a_shuffled_gyroscope_is_refused() -> None:
+    """The pieces belong to the recording but are in the wrong order."""
     for seed in range(6):
         recorded = make(Setup(hand_motion(seed), points=25, seed=seed))
         recorded = replace(recorded, imu=shuffled(recorded, seed))
@@ -263,7 +268,7 @@ def test_shuffled_gyroscope_is_never_taken_at_a_wrong_offset() -> None:
 
 
 def test_few_tracks_are_refused() -> None:
-    """Pairs with a handful of points, or a handful of pairs, determine nothing."""
+    """Pairs with few points, or few pairs, determine nothing."""
     recorded = make(Setup(hand_motion(2), points=8, frames=20))
     assert "tracked points" in estimate_time_offset(recorded.observed(), recorded.imu, recorded.profile).reason
     recorded = make(Setup(hand_motion(2), points=40, frames=6))
@@ -271,21 +276,21 @@ def test_few_tracks_are_refused() -> None:
     assert not estimate_time_offset(replace(recorded, pairs=[]).observed(), recorded.imu, recorded.profile).determined
 
 
-def test_gyroscope_elsewhere_in_time_is_refused() -> None:
-    """Inertial data that end before the frames begin are said to not cover them."""
+def test_a_gyroscope_at_other_times_is_refused() -> None:
+    """The reason for samples that end before the frames begin is missing coverage."""
     recorded = make(Setup(hand_motion(2), points=40, frames=20))
     late = replace(recorded, frame_time_s=recorded.frame_time_s + 50.0)
     assert "cover" in estimate_time_offset(late.observed(), late.imu, late.profile).reason
 
 
 def test_offset_beyond_the_search_is_refused() -> None:
-    """An offset outside the search is not replaced by the best one inside."""
+    """An offset outside the search range is not replaced by the best one inside."""
     recorded = make(Setup(hand_motion(3), time_offset_s=0.4, points=40))
     assert not estimate_time_offset(recorded.observed(), recorded.imu, recorded.profile, search_s=0.2).determined
 
 
 def test_agreement_names_a_better_offset() -> None:
-    """At a wrong offset the pictures do not agree, and the offset at which they would is said."""
+    """At a wrong offset the frames do not agree, and a matching offset is reported."""
     recorded = make(Setup(hand_motion(4), time_offset_s=-0.3, points=40))
     assert agreement(recorded, -0.3).agrees
     wrong = agreement(recorded, 0.0)
@@ -293,11 +298,11 @@ def test_agreement_names_a_better_offset() -> None:
     assert wrong.best_offset_s == pytest.approx(-0.3, abs=0.02)
 
 
-# ── which frames ─────────────────────────────────────────────────────────────────────────────────────────────────
+# ── selection of frames ──────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_chosen_frames_are_few_lively_and_spread() -> None:
-    """From a long capture at most 60 frames come, in runs, preferring motion, none of those to be skipped."""
+def test_selected_frames_are_few_have_high_motion_and_are_spread() -> None:
+    """From a long capture at most 60 usable frames are selected, in runs with high motion."""
     frames = [Frame(k, k, k / 30, skip_reason="start-up" if k < 12 else None) for k in range(3000)]
     time_s = np.arange(-1, 101, 0.005)
     lively = np.where((time_s % 20 > 8) & (time_s % 20 < 9), 1.0, 0.01)
@@ -313,8 +318,8 @@ def test_chosen_frames_are_few_lively_and_spread() -> None:
     assert np.mean([7.5 < (k / 30) % 20 < 9.5 for k in chosen]) > 0.6
 
 
-def test_short_captures_are_taken_whole() -> None:
-    """Up to the cap every usable frame is taken."""
+def test_short_captures_are_used_completely() -> None:
+    """Up to the limit every usable frame is used."""
     frames = [Frame(k, k, k / 30) for k in range(25)]
     imu = ImuSamples(np.arange(0, 1, 0.01), np.ones((100, 3)), np.full((100, 3), np.nan))
     assert choose_pairs(frames, imu) == list(range(25))
@@ -326,7 +331,7 @@ Measured = tuple[ObservedTracks, ImuSamples, CameraProfile]
 
 
 def measured(name: str) -> Measured:
-    """Track a measured capture; skipped where there are none."""
+    """Track a measured capture; skip the test without one."""
     root = os.environ.get("VIREST_REALDATA")
     if not root or not (Path(root) / name).is_dir():
         pytest.skip("VIREST_REALDATA does not point to the measured captures")
@@ -342,7 +347,10 @@ def measured(name: str) -> Measured:
 
 
 def test_car_recording_gives_its_offset() -> None:
-    """lhaippp_car: −5.1 ms within two deviations though the nominal readout is 5 % long; its middle row to 0.4 ms."""
+    """lhaippp_car: −5.1 ms within two deviations, although the nominal readout is 5 % too long.
+
+    Middle row within 0.4 ms.
+    """
     recorded = measured("lhaippp_car")
     found = estimate_time_offset(*recorded)
     assert found.determined, found.reason
@@ -353,8 +361,8 @@ def test_car_recording_gives_its_offset() -> None:
     assert check_agreement(*recorded[:2], replace(recorded[2], time_offset_s=found.time_offset_s)).agrees
 
 
-def test_shaken_phone_gives_nearly_half_a_second() -> None:
-    """nexus5_162941: the offset is found from zero, its drift and its unknown exposure and readout are said."""
+def test_a_shaken_phone_gives_an_offset_of_nearly_half_a_second() -> None:
+    """nexus5_162941: the offset is found from zero, and its drift is reported."""
     recorded = measured("nexus5_162941")
     found = estimate_time_offset(*recorded)
     assert found.determined, found.reason
@@ -367,7 +375,7 @@ def test_shaken_phone_gives_nearly_half_a_second() -> None:
 
 
 def test_gimballed_drone_gives_its_offset() -> None:
-    """gopro_karma: −20 to −30 ms, with a deviation above a millisecond since the readout is unknown."""
+    """gopro_karma: −18 ms to −32 ms, with a deviation above 1 ms since the readout is unknown."""
     recorded = measured("gopro_karma")
     found = estimate_time_offset(*recorded)
     assert found.determined, found.reason
@@ -376,8 +384,8 @@ def test_gimballed_drone_gives_its_offset() -> None:
     assert check_agreement(*recorded[:2], replace(recorded[2], time_offset_s=found.time_offset_s)).agrees
 
 
-def test_pictures_stabilised_in_the_camera_are_refused() -> None:
-    """gopro_hero7: no offset, no agreement, at any offset."""
+def test_frames_stabilised_in_the_camera_are_refused() -> None:
+    """gopro_hero7: neither an offset nor agreement at any offset."""
     recorded = measured("gopro_hero7")
     found = estimate_time_offset(*recorded)
     assert not found.determined

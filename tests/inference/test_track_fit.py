@@ -1,4 +1,4 @@
-"""Terms recovered from noisy tracks, deviations that hold, outliers, priors, walls, windows."""
+"""Terms recovered from noisy tracks, correct deviations, outliers, priors, walls and windows."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ASIDE = {
     "focal_drift": (0.012,),
     "stabilisation": (-0.16, 0.22, 0.02, -0.03),
 }
-"""How far each term of a spoilt profile lies from the truth."""
+"""Distance of each term of an altered profile from the truth."""
 PORTRAIT = Setup(seed=11, gyro_noise_rad_s=0.001, frames=40)
 LANDSCAPE = Setup(
     seed=12, width=640, height=480, centre_px=(331.0, 226.0), readout_direction="top_to_bottom", frames=40,
@@ -49,29 +49,29 @@ WALL = Setup(
 
 
 def spoilt(profile: CameraProfile, terms: Sequence[Term]) -> CameraProfile:
-    """The true profile with each term put aside."""
+    """The true profile with each term changed."""
     for term in terms:
         profile = term.change(profile, np.array(ASIDE[term.name]))
     return profile
 
 
 def errors(fitted: TrackFit) -> Array:
-    """Fitted changes less those that lead back to the truth."""
+    """Errors of the fitted changes."""
     return fitted.change + np.concatenate([ASIDE[term.name] for term in fitted.terms])
 
 
 def deviations(fitted: TrackFit) -> Array:
-    """Standard deviations of all terms' values."""
+    """Standard deviations of the values of all terms."""
     return np.concatenate([fitted.std(term.name) for term in fitted.terms])
 
 
 def fitted_from(recording: Recording, terms: Sequence[Term]) -> TrackFit:
-    """Fit turning only, from a spoilt profile."""
+    """Fit rotation only, from an altered profile."""
     return fit_tracks(recording.imu, recording.table(), spoilt(recording.profile, terms), terms)
 
 
 def fitted_wall(recording: Recording, terms: Sequence[Term], windows: list[list[int]] | None = None) -> TrackFit:
-    """Fit with the accelerometer's path, from a spoilt profile and a scene that knows nothing."""
+    """Fit with the accelerometer's path, from an altered profile and a default scene."""
     profile, table = spoilt(recording.profile, terms), recording.table(windows)
     scene = start_scene(recording.imu, integrate_motion(recording.imu, profile, translation=True), table, 0.7)
     return fit_tracks(recording.imu, table, profile, terms, scene)
@@ -91,20 +91,20 @@ def fitted_wall(recording: Recording, terms: Sequence[Term], windows: list[list[
     ],
     ids=lambda value: "-".join(t.name for t in value) if isinstance(value, tuple) else "",
 )
-def test_every_term_is_found(setup: Setup, terms: tuple[Term, ...]) -> None:
-    """Each value within four deviations of the truth, a small part of what it was put aside by, nothing left over."""
+def test_every_term_is_recovered(setup: Setup, terms: tuple[Term, ...]) -> None:
+    """Each value lies within four deviations of the truth, which are small, and only noise remains."""
     fitted = fitted_from(recorded(setup), terms)
     assert fitted.scale == pytest.approx(1.0, abs=0.08)
     assert (np.abs(errors(fitted)) < 4 * deviations(fitted) + 1e-9).all()
     put_aside = np.abs(errors(fitted) - fitted.change)
     if terms_of.STABILISATION in terms:
-        put_aside[-2:] = np.inf  # how the lens leant when the log began is forgotten by the first frame
+        put_aside[-2:] = np.inf  # the first frame no longer depends on the stabiliser's lean at the start of the log
     assert (deviations(fitted) < 0.2 * put_aside).all()
     assert set(fitted.slices) == {term.name for term in terms}
 
 
-def test_a_readout_of_the_wrong_sense_is_found_through_nought() -> None:
-    """Begun as a global shutter read upwards, a picture read downwards ends with a readout below nought."""
+def test_a_readout_of_the_opposite_direction_becomes_negative() -> None:
+    """Started as a global shutter read upwards, a readout downwards ends with a negative readout time."""
     recording = recorded(replace(LANDSCAPE, clock_skew=0.0))
     shutter = replace(recording.profile.shutter, readout_time_s=0.0, readout_direction="bottom_to_top")
     start = replace(recording.profile, shutter=shutter)
@@ -113,8 +113,8 @@ def test_a_readout_of_the_wrong_sense_is_found_through_nought() -> None:
     assert fitted.scale == pytest.approx(1.0, abs=0.08)
 
 
-def test_deviations_hold() -> None:
-    """Over 20 hands and noises the errors are about as large as the deviations say, none many times larger."""
+def test_deviations_match_the_errors() -> None:
+    """Over 20 motions and noises the errors match the deviations, and none is many times larger."""
     scores, terms = [], (terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.GYRO_BIAS)
     for seed in range(200, 220):
         fitted = fitted_from(Recording(Setup(seed=seed, frames=22, points=18)), terms)
@@ -126,8 +126,8 @@ def test_deviations_hold() -> None:
     assert (np.abs(score) < 5).all()
 
 
-def test_a_third_of_the_points_on_something_else_does_no_harm() -> None:
-    """Values stay within five deviations, and the weights tell which points moved by themselves."""
+def test_a_third_of_outliers_does_no_harm() -> None:
+    """Values stay within five deviations, and the weights identify the outliers."""
     recording = recorded(replace(PORTRAIT, outliers=1 / 3))
     fitted = fitted_from(recording, BASIC)
     assert (np.abs(errors(fitted)) < 5 * deviations(fitted)).all()
@@ -140,10 +140,10 @@ def test_a_third_of_the_points_on_something_else_does_no_harm() -> None:
     assert np.median(fitted.weight[step < 0.3]) > 0.7
 
 
-def test_a_prior_holds_a_term_to_where_it_began() -> None:
-    """A prior as sharp as the data shares the way with them; one much sharper stays, one much wider hardly holds.
+def test_a_prior_holds_a_term_at_its_start() -> None:
+    """A prior as sharp as the data halves the change; a sharper one prevents it, and a wider one hardly matters.
 
-    Of a unit normal's information, Cauchy's loss at 2.4 has 0.81 of what its mean weight says.
+    For a unit normal, Cauchy's loss at 2.4 has 0.81 of the information that its mean weight suggests.
     """
     recording = recorded(PORTRAIT)
     start = terms_of.shift_offset(recording.profile, np.array([0.0002]))
@@ -157,8 +157,8 @@ def test_a_prior_holds_a_term_to_where_it_began() -> None:
         assert held.change[0] == pytest.approx(part * way, abs=0.04 * abs(way))
 
 
-def test_nothing_to_fit_changes_nothing() -> None:
-    """Without terms the profile is judged as it is: the differences of a wrong offset stay."""
+def test_without_terms_the_profile_is_only_judged() -> None:
+    """The differences of a wrong offset stay."""
     recording = recorded(PORTRAIT)
     wrong = terms_of.shift_offset(recording.profile, np.array([0.01]))
     judged = fit_tracks(recording.imu, recording.table(), wrong, (), max_iterations=0)
@@ -172,8 +172,8 @@ def test_nothing_to_fit_changes_nothing() -> None:
 # ── walls ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_the_path_before_a_wall_is_found_with_the_profile() -> None:
-    """Swaying before a wall: turning alone leaves much, the accelerometer's path nothing; both are found."""
+def test_the_path_in_front_of_a_wall_is_found_with_the_profile() -> None:
+    """For a swaying camera, rotation alone leaves a large residual, the accelerometer's path only noise."""
     recording = recorded(WALL)
     plain = fitted_from(recording, BASIC)
     fitted = fitted_wall(recording, BASIC)
@@ -189,7 +189,7 @@ def test_the_path_before_a_wall_is_found_with_the_profile() -> None:
 
 
 def test_two_windows_have_a_velocity_and_a_plane_each() -> None:
-    """The same wall seen from two places, found for each window as the truth of that window."""
+    """The same wall seen from two places has the true values of each window."""
     recording = recorded(WALL)
     windows = [list(range(20)), list(range(20, 44))]
     fitted = fitted_wall(recording, BASIC[:1], windows)
@@ -202,8 +202,8 @@ def test_two_windows_have_a_velocity_and_a_plane_each() -> None:
     assert fitted.scale == pytest.approx(1.0, abs=0.08)
 
 
-def test_points_off_the_wall_widen_the_depths_and_not_the_errors() -> None:
-    """Points strewn between 1/0.3 and 1/0.7 m, sheared by no plane: a spread is measured, the offset still holds."""
+def test_points_off_the_wall_widen_the_depth_spread() -> None:
+    """Points between 1/0.3 m and 1/0.7 m fit no plane: a spread is measured, and the offset is still right."""
     setup = replace(WALL, plane_per_m=None, inverse_depth_per_m=(0.3, 0.7), sway_m=0.1)
     fitted = fitted_wall(recorded(setup), BASIC[:1])
     flat = fitted_wall(recorded(replace(WALL, sway_m=0.1)), BASIC[:1])
@@ -212,8 +212,8 @@ def test_points_off_the_wall_widen_the_depths_and_not_the_errors() -> None:
     assert abs(errors(fitted)[0]) < 4 * deviations(fitted)[0]
 
 
-def test_a_gyroscope_s_wander_does_not_shrink_with_tracking() -> None:
-    """Sharper tracks tell a readout's or a lens's values better, but a gyroscope drifts all the same."""
+def test_gyroscope_drift_does_not_shrink_with_tracking_noise() -> None:
+    """Better tracks improve the lens's values, but the drift of the gyroscope stays."""
     fitted = fitted_from(recorded(PORTRAIT), BASIC)
     blurred, sharp = (bias_std(fitted, "gyro_bias", noise_px) for noise_px in (0.3, 0.05))
     assert np.all(blurred >= sharp)
@@ -221,8 +221,8 @@ def test_a_gyroscope_s_wander_does_not_shrink_with_tracking() -> None:
     assert np.all(bias_std(fitted, "focal_length", 0.05) < 0.5 * bias_std(fitted, "focal_length", 0.15))
 
 
-def test_no_number_of_points_tells_more_than_their_shared_errors_leave() -> None:
-    """Eight times the points are three times as sure of a lens by their scatter; what tracking shares stays."""
+def test_more_points_do_not_reduce_common_errors() -> None:
+    """Eight times the points reduce the scatter of a lens value, but not the tracking errors that they share."""
     many = recorded(replace(PORTRAIT, points=80, noise_px=0.8))
     table = many.table()
     fits = [
@@ -238,8 +238,8 @@ def test_no_number_of_points_tells_more_than_their_shared_errors_leave() -> None
     assert all_bias == pytest.approx(np.hypot(shared, fits[1].by_coding[0]), rel=1e-6)
 
 
-def test_relief_that_stands_in_its_place_is_one_error_and_not_many() -> None:
-    """Walking on, walls pull the same places of every picture: deviations are wider than for relief strewn about."""
+def test_coherent_relief_widens_deviations_more_than_scattered_relief() -> None:
+    """During a walk, walls bias the same regions of every frame, so the deviations are larger."""
     recording = recorded(replace(WALL, sway_m=0.02, velocity_m_s=(0.05, -0.1, 1.0), points=200))
     table = recording.table()
     scene = recording.scene(table)
@@ -263,7 +263,7 @@ def test_relief_that_stands_in_its_place_is_one_error_and_not_many() -> None:
 
 
 def test_a_wall_needs_an_accelerometer() -> None:
-    """Without one there is no path to fit, and the message says what to do."""
+    """Without one there is no path to fit, and the error says so."""
     recording = recorded(WALL)
     table = recording.table()
     blind = replace(recording.imu, accel_m_s2=np.full_like(recording.imu.accel_m_s2, np.nan))
@@ -271,8 +271,8 @@ def test_a_wall_needs_an_accelerometer() -> None:
         fit_tracks(blind, table, recording.profile, BASIC[:1], recording.scene(table))
 
 
-def test_the_scene_begins_with_gravity_down() -> None:
-    """At rest, before a plane across the view, with gravity of 9.81 m/s² within ten degrees of the truth."""
+def test_the_initial_scene_has_gravity_down() -> None:
+    """It starts at rest in front of a frontal plane, with gravity of 9.81 m/s² within 10° of the truth."""
     recording = recorded(WALL)
     table = recording.table()
     scene = start_scene(recording.imu, integrate_motion(recording.imu, recording.profile, translation=True), table, 0.4)
@@ -285,8 +285,8 @@ def test_the_scene_begins_with_gravity_down() -> None:
     np.testing.assert_allclose(scene.plane_per_m, sight, atol=1e-4)
 
 
-def test_a_swaying_camera_is_found_from_rest() -> None:
-    """Accelerations of 10 m/s², integrated twice from rest, leave the room; fits stayed there, 10 σ from the points."""
+def test_a_swaying_camera_is_fitted_from_rest() -> None:
+    """Accelerations of 10 m/s², integrated from rest, lead far away; the fit must still converge."""
     recording = recorded(
         Setup(seed=59, sway_m=0.4, velocity_m_s=(-0.4, 0.3, -0.6), plane_per_m=(0.0, -0.1, 0.4), rate_rad_s=1.2,
               frames=70, points=15, gyro_noise_rad_s=0.001)
@@ -301,8 +301,8 @@ def test_a_swaying_camera_is_found_from_rest() -> None:
     np.testing.assert_allclose(fitted.scene.plane_per_m, truth.plane_per_m, atol=0.03)
 
 
-def test_what_cancels_in_a_combination_is_not_doubted() -> None:
-    """Two values whose errors cancel in their sum; a correction of one alone must not come back in it."""
+def test_errors_that_cancel_in_a_combination_are_excluded() -> None:
+    """The errors of two values cancel in their sum; correcting one alone must not add them again."""
     together = np.array([[1.0, -1.0], [-1.0, 1.0]])
     by_region = np.array([[3.0, -3.0], [-3.0, 3.0]])
     model = CovarianceModel(1e-6 * np.eye(2), together, by_region, np.zeros((2, 2)), relief=np.array([[0.5, -0.5]]))
@@ -316,7 +316,7 @@ def test_what_cancels_in_a_combination_is_not_doubted() -> None:
     np.testing.assert_allclose(np.diag(lopsided.propagate(np.eye(2))), [4.0, 1.0])
 
 
-# ── points that coding draws to the blocks above ─────────────────────────────────────────────────────────────────
+# ── bias of points towards the coding blocks above ───────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("read", ["top_to_bottom", "bottom_to_top"])
@@ -324,9 +324,9 @@ def test_what_cancels_in_a_combination_is_not_doubted() -> None:
     "term", [terms_of.TIME_OFFSET, terms_of.PLAIN_READOUT, terms_of.CLOCK_SKEW], ids=lambda term: term.name
 )
 def test_steps_of_the_rows_above_are_within_the_deviation(term: Term, read: str) -> None:
-    """Points that step as the picture does above them seem late, or early where rows are read upwards.
+    """Points biased towards the motion above them seem late, or early if rows are read upwards.
 
-    Whichever of offset, readout and skew is fitted, its deviation holds that.
+    Whichever of offset, readout and skew is fitted, its deviation includes this bias.
     """
     recording = recorded(replace(LANDSCAPE, readout_direction=read, gyro_noise_rad_s=0.0, noise_px=0.15, frames=60))
     table, profile = replace(recording.table(), bits_per_px=0.1), recording.profile
@@ -345,8 +345,8 @@ def test_steps_of_the_rows_above_are_within_the_deviation(term: Term, read: str)
         assert (moved < 0) == (read == "top_to_bottom")
 
 
-def test_what_a_still_camera_centre_explains_is_apart_from_the_rows_times() -> None:
-    """Slopes at one instant are those of a global shutter; rows' times add the rest, along the readout alone."""
+def test_motion_at_one_instant_is_separate_from_row_times() -> None:
+    """Derivatives at one instant are those of a global shutter; row times add a part along the readout only."""
     recording = recorded(replace(LANDSCAPE, gyro_noise_rad_s=0.0, clock_skew=0.0, frames=20))
     table, profile = recording.table(), recording.profile
     known = integrate_motion(recording.imu, profile, translation=False)
@@ -360,8 +360,8 @@ def test_what_a_still_camera_centre_explains_is_apart_from_the_rows_times() -> N
     np.testing.assert_allclose(shifted.second_px - at.second_px, slopes.at_once[1], atol=1e-7)
 
 
-def test_steps_that_go_alike_everywhere_are_not_drawn() -> None:
-    """Without a slope nothing is off; where it is small, by no more than a block's side."""
+def test_uniform_motion_has_no_coding_bias() -> None:
+    """Without a gradient there is no bias; for a small gradient it is at most that over a block's side."""
     none, little, even = np.zeros((2, 5, 2)), np.full((2, 5, 2), 1e-3), np.zeros((5, 2))
     assert not drawn_px(StepSlopes(none, none, even), np.full(5, 0.2), 0.1).any()
     slight = drawn_px(StepSlopes(little, none, even), np.full(5, 0.5), 0.1)
@@ -369,7 +369,7 @@ def test_steps_that_go_alike_everywhere_are_not_drawn() -> None:
 
 
 def test_coding_bias_follows_the_bit_rate() -> None:
-    """A quarter of the bit rate doubles every bias; pictures that no encoder has touched have none."""
+    """A quarter of the bit rate doubles every bias; uncoded frames have none."""
     rng = np.random.default_rng(5)
     slopes, noise_px = StepSlopes(*rng.normal(0, 0.01, (2, 2, 5, 2)), rng.normal(0, 0.5, (5, 2))), np.full(5, 0.05)
     coarse, fine, uncoded = (drawn_px(slopes, noise_px, bits) for bits in (0.1, 0.4, np.inf))
@@ -378,8 +378,8 @@ def test_coding_bias_follows_the_bit_rate() -> None:
     assert not uncoded.any()
 
 
-def test_coding_flattens_a_lens() -> None:
-    """A flow with less curvature looks like a smaller k1; the correction by the mean error restores the value."""
+def test_coding_bias_reduces_k1() -> None:
+    """A flow with less curvature looks like a smaller k1; the prediction of the mean error matches the change."""
     recording = recorded(replace(LANDSCAPE, gyro_noise_rad_s=0.0, noise_px=0.1, clock_skew=0.0))
     table, profile = replace(recording.table(), bits_per_px=0.1), recording.profile
     known = integrate_motion(recording.imu, profile, translation=False)

@@ -1,4 +1,4 @@
-"""The noise of tracked steps, measured without any camera model, against noise that was put in."""
+"""The noise of tracked points, measured without a camera model, compared with the noise put in."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ HAND = Setup(seed=31, frames=25, points=110, noise_px=0.2)
 
 @pytest.mark.parametrize("noise_px", [0.05, 0.2, 0.6])
 @pytest.mark.parametrize("direction", ["right_to_left", "bottom_to_top"])
-def test_noise_under_a_hands_motion_is_measured_to_a_tenth(noise_px: float, direction: str) -> None:
-    """Turning, readout and the lens are a smooth flow; what is left is the noise put in."""
+def test_noise_during_hand_motion_is_measured_within_a_tenth(noise_px: float, direction: str) -> None:
+    """Rotation, readout and lens give a smooth flow; the rest is noise."""
     setup = replace(HAND, noise_px=noise_px, readout_direction=direction, k1=0.03)
     found = step_noise_px(recorded(setup).pairs)
     assert found.shape == (24,)
@@ -25,14 +25,14 @@ def test_noise_under_a_hands_motion_is_measured_to_a_tenth(noise_px: float, dire
     assert (np.abs(found / noise_px - 1) < 0.35).all()
 
 
-def test_a_walls_parallax_is_no_noise() -> None:
-    """Swaying before a tilted wall leaves the measure alone."""
+def test_parallax_of_a_wall_is_not_noise() -> None:
+    """Sway in front of a tilted wall does not change the measured noise."""
     setup = replace(HAND, sway_m=0.06, plane_per_m=(0.15, -0.1, 0.6))
     assert np.median(step_noise_px(recorded(setup).pairs)) == pytest.approx(0.2, rel=0.1)
 
 
 def test_each_pair_has_its_own_noise() -> None:
-    """Pairs five times noisier are told as such, in their order."""
+    """Pairs with five times the noise are identified, in their order."""
     rng = np.random.default_rng(7)
     pairs = [
         replace(
@@ -46,8 +46,8 @@ def test_each_pair_has_its_own_noise() -> None:
     assert found[~noisy] == pytest.approx(0.2, rel=0.35)
 
 
-def test_lost_points_raise_the_measure_little() -> None:
-    """A seventh of the points tens of pixels off: still within a quarter, and they stand out of the residual."""
+def test_outliers_hardly_raise_the_noise() -> None:
+    """With a seventh of the points tens of pixels off, the noise is right within 25 %; the residual shows them."""
     rng = np.random.default_rng(8)
     pairs = []
     for pair in recorded(HAND).pairs:
@@ -61,8 +61,8 @@ def test_lost_points_raise_the_measure_little() -> None:
 
 
 @pytest.mark.parametrize("points", [13, 30, 50])
-def test_few_points_take_a_flow_of_lower_order(points: int) -> None:
-    """Under a flow that is linear in the place, noise is found on average however few the points, never as nought."""
+def test_few_points_use_a_flow_of_lower_order(points: int) -> None:
+    """For a linear flow, the noise is right on average for any number of points and never zero."""
     rng = np.random.default_rng(9)
     shear = np.array([[1.004, -0.011], [0.006, 0.993]])
     pairs = []
@@ -72,7 +72,7 @@ def test_few_points_take_a_flow_of_lower_order(points: int) -> None:
     assert np.mean(step_noise_px(pairs)) == pytest.approx(0.3, rel=0.1)
 
 
-def test_perfect_tracks_have_a_least_noise() -> None:
-    """Points that follow a flow exactly are still not trusted without end."""
+def test_perfect_tracks_have_a_minimum_noise() -> None:
+    """Points that follow a flow exactly are not trusted without limit."""
     first = np.random.default_rng(3).uniform(0, 400, (60, 2))
     assert step_noise_px([TrackPair(0, 1, first, first + np.array([3.0, -2.0]))]) == pytest.approx(0.01)

@@ -1,4 +1,4 @@
-"""Tracking on pictures whose motion is known."""
+"""Tracking on pictures with known motion."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def view(picture: Picture, shift_px: tuple[float, float], size: tuple[int, int] 
 
 @pytest.mark.parametrize("shift_px", [(0.4, -1.7), (17.3, 9.6), (-58.0, 37.0)])
 def test_points_follow_the_picture(shift_px: tuple[float, float]) -> None:
-    """Points move with the picture, from below a pixel to 70 px, to 0.05 px in the median."""
+    """Points move with the content, from less than 1 px to 70 px, with a median error below 0.05 px."""
     scene = texture(700, 800)
     pair = track_pairs([(4, view(scene, (0, 0))), (5, view(scene, shift_px))])[0]
     assert (pair.first, pair.second) == (4, 5)
@@ -44,16 +44,16 @@ def test_points_follow_the_picture(shift_px: tuple[float, float]) -> None:
     assert np.median(np.abs(moved - shift_px)) < 0.05
 
 
-def test_blurred_pictures_are_followed() -> None:
-    """A 15 px motion blur of both pictures does not lose the points."""
+def test_blurred_pictures_are_tracked() -> None:
+    """A motion blur of 15 px in both pictures does not lose the points."""
     scene = cv2.filter2D(texture(700, 800), -1, np.full((1, 15), 1 / 15))
     pair = track_pairs([(0, view(scene, (0, 0))), (1, view(scene, (12.5, -3.0)))])[0]
     assert len(pair) > 60
     assert np.median(np.abs(pair.points_second_px - pair.points_first_px - (12.5, -3.0))) < 0.1
 
 
-def test_parts_of_a_movie_give_what_one_stream_gives(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cut anywhere, across a jump and beside a repeated picture, no pair is lost, doubled or new."""
+def test_tracking_in_parts_gives_the_same_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cuts, jumps and repeated frames neither lose, duplicate nor add a pair."""
     scene = texture(700, 800)
     movie = {k: view(scene, (2.5 * k, -1.5 * k), (120, 160)) for k in (*range(9), *range(20, 25))}
     movie[4] = movie[3]
@@ -72,8 +72,8 @@ def test_parts_of_a_movie_give_what_one_stream_gives(monkeypatch: pytest.MonkeyP
         assert max(done) <= length
 
 
-def test_halving_keeps_stored_pixels() -> None:
-    """Large pictures are halved for tracking; points are still those of the stored picture."""
+def test_halving_keeps_stored_coordinates() -> None:
+    """Large pictures are halved for tracking; points have the coordinates of the stored picture."""
     scene = texture(1300, 1300)
     big = [view(scene, shift, (700, 1000)) for shift in ((0, 0), (10.0, 6.0))]
     pair = track_pairs(list(enumerate(big)))[0]
@@ -86,15 +86,15 @@ def test_halving_keeps_stored_pixels() -> None:
 
 
 def test_repeats_and_jumps_give_no_pair() -> None:
-    """A picture that repeats its predecessor, a missing one, and a jump in the index break the chain."""
+    """A repeated picture, a missing one and a jump in the index break the chain."""
     scene = texture(700, 800)
     a, b, c, d = (view(scene, (2.0 * k, 1.0 * k)) for k in range(4))
     pairs = track_pairs([(0, a), (1, b), (2, b.copy()), (3, c), (4, d), (5, None), (6, a), (9, b), (10, c)])
     assert [(pair.first, pair.second) for pair in pairs] == [(0, 1), (3, 4), (9, 10)]
 
 
-def test_textureless_pictures_give_nothing() -> None:
-    """Flat pictures have no points, also with sensor noise of two levels."""
+def test_textureless_pictures_give_no_pairs() -> None:
+    """Flat pictures have no points, even with sensor noise of two levels."""
     rng = np.random.default_rng(0)
     noisy = [(k, rng.normal(100, 2, (360, 480)).astype(np.uint8)) for k in range(3)]
     assert track_pairs(noisy) == []
@@ -102,7 +102,7 @@ def test_textureless_pictures_give_nothing() -> None:
 
 
 def test_points_are_spread_over_the_picture() -> None:
-    """A strongly textured corner does not take all points: each cell of the grid has its own few."""
+    """A strongly textured corner does not take all points: the number per grid cell is limited."""
     picture = (texture(360, 480).astype(float) * 0.3 + 60).astype(np.uint8)
     picture[:120, :120] = texture(120, 120, 1)
     corners = find_corners(picture, TrackingSettings())

@@ -1,4 +1,4 @@
-"""Directions of travel from parallax alone, and a readout found although the camera drives forward."""
+"""Directions of travel from parallax alone, and the readout time of a camera that drives forward."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ WANTED = (terms_of.TIME_OFFSET, terms_of.READOUT, terms_of.IMU_ROTATION)
 
 
 def unit(vectors: Array) -> Array:
-    """The vectors at length 1."""
+    """The vectors, normalised to length 1."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def parallax(seed: int, groups: int, points: int) -> tuple[Array, Array, Array, Array]:
-    """Differences (n, 2), flow (n, 2, 3), group (n,) and directions (groups, 3) of a pinhole that travels."""
+    """Differences (n, 2), flow (n, 2, 3), group (n,) and directions (groups, 3) of a moving pinhole camera."""
     rng = np.random.default_rng(seed)
     direction = unit(rng.normal((0.0, 0.0, 1.5), 1.0, (groups, 3)))
     group = np.arange(groups * points) % groups
@@ -42,7 +42,7 @@ def parallax(seed: int, groups: int, points: int) -> tuple[Array, Array, Array, 
 
 @pytest.mark.parametrize(("groups", "points"), [(1, 300), (4, 150)])
 def test_directions_are_found_up_to_their_sign(groups: int, points: int) -> None:
-    """Unknown depths, noise and a tenth of lost points: within two degrees, each group its own."""
+    """With unknown depths, noise and 10 % outliers, each group's direction is right within 2°."""
     difference, flow, group, direction = parallax(3, groups, points)
     lost = np.random.default_rng(4).random(len(group)) < 0.1
     difference = difference + lost[:, None] * np.random.default_rng(5).uniform(-30, 30, difference.shape)
@@ -53,8 +53,8 @@ def test_directions_are_found_up_to_their_sign(groups: int, points: int) -> None
     assert (np.abs((again * direction).sum(axis=1)) > np.cos(np.radians(2))).all()
 
 
-def test_what_directions_explain_is_taken_out() -> None:
-    """After the elimination no turn of a direction changes the weighted sum of squares, to first order."""
+def test_directions_are_eliminated() -> None:
+    """After the elimination, no rotation of a direction changes the weighted sum of squares to first order."""
     difference, flow, group, direction = parallax(6, 3, 120)
     rng = np.random.default_rng(7)
     weight, rows = rng.uniform(0.2, 1, len(group)), rng.normal(size=(len(group), 2, 2))
@@ -77,7 +77,7 @@ def test_what_directions_explain_is_taken_out() -> None:
 
 
 def test_a_drive_is_fitted_across_its_parallax() -> None:
-    """Forward before unknown depths: turning alone gives a wrong readout, with a direction it is found."""
+    """Driving forward at unknown depths: rotation alone gives a wrong readout time, a direction gives the right one."""
     recording, aside = recorded(DRIVE), np.array([0.004, -0.006, 0.008, 0.011, -0.009])
     table = recording.table()
     start = recording.profile
@@ -97,7 +97,10 @@ def test_a_drive_is_fitted_across_its_parallax() -> None:
 
 
 def test_a_wandering_camera_has_a_direction_for_each_pair() -> None:
-    """Swaying to and fro near things: one direction leaves much, one a pair leaves the noise, and the offset holds."""
+    """For a swaying camera near objects, one direction leaves a residual.
+
+    One per pair leaves noise, and the offset is right.
+    """
     recording = recorded(
         replace(DRIVE, sway_m=0.08, velocity_m_s=(0.0, 0.0, 0.3), inverse_depth_per_m=(0.05, 0.4), points=60)
     )
@@ -117,8 +120,8 @@ def test_a_wandering_camera_has_a_direction_for_each_pair() -> None:
     assert np.median(agree[fast]) > np.cos(np.radians(5))
 
 
-def test_slopes_serve_while_directions_are_found_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where points go by turning alone, and how that depends on a profile, no direction changes: fewer slopes do."""
+def test_derivatives_are_reused_while_directions_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Directions do not change the prediction from rotation, so fewer derivatives suffice."""
     recording = recorded(DRIVE)
     table, taken = recording.table(), []
     start = terms_of.shift_offset(recording.profile, np.array([0.004]))

@@ -1,4 +1,4 @@
-"""A phone's unsharp mask is seen beside edges, told from what else shapes them, and undone."""
+"""A phone's unsharp mask is detected at edges, distinguished from other effects, and reversed."""
 
 import cv2
 import numpy as np
@@ -14,10 +14,10 @@ AT_REST = TurningCamera(phone(SIZE, SIZE, 300.0), (1e-4, 0.0, 0.0)).motion
 
 
 def strokes(rng, width_px=0.75, stroke_px=3.0, bright=200.0, dark=60.0):
-    """Dark strokes of print in all directions on bright paper, softened by a lens, grey levels."""
+    """Dark printed strokes in all directions on bright paper, softened by a lens, in grey levels."""
     y, x = np.mgrid[:SIZE, :SIZE].astype(float)
     ink = np.zeros((SIZE, SIZE))
-    near = 17  # beyond it nothing is left of a stroke
+    near = 17  # a stroke ends within this distance
     for top in range(24, SIZE - 20, 34):
         for left in range(24, SIZE - 20, 34):
             angle, half = rng.uniform(0, np.pi), rng.uniform(7, 9)
@@ -33,7 +33,7 @@ def strokes(rng, width_px=0.75, stroke_px=3.0, bright=200.0, dark=60.0):
 
 
 def discs(rng):
-    """Discs of even light that lie over each other: steps of all heights, both sides of which are flat."""
+    """Overlapping discs of uniform light: steps of all heights with flat sides."""
     fine = np.full((2 * SIZE, 2 * SIZE), 128, np.uint8)
     for _ in range(250):
         x, y, radius_px = (int(v) for v in rng.uniform(0, [2 * SIZE, 2 * SIZE, 70]))
@@ -42,28 +42,28 @@ def discs(rng):
 
 
 def masked(grey, amount, radius_px):
-    """A grey picture, or a colour one, with the mask."""
+    """A grey or colour picture with the mask."""
     colour = (grey if grey.ndim == 3 else np.repeat(grey[..., None], 3, axis=-1)) / 255
     shown = 255 * sharpen(colour.astype(np.float32), amount, radius_px)
     return shown if grey.ndim == 3 else shown[..., 0]
 
 
 def recorded(rng, grey, amount=0.0, radius_px=1.0):
-    """8 bits, the mask on them, with a grey level of noise."""
+    """An 8-bit picture with the mask and noise of one grey level."""
     shown = masked(grey, amount, radius_px) if amount else grey
     return np.clip(np.rint(shown + rng.standard_normal(grey.shape)), 0, 255).astype(np.uint8)
 
 
 def seen(rng, scene, **mask):
-    """What three frames of a camera at rest show."""
+    """The mask found in three frames of a camera at rest."""
     grey = scene(rng)
     return seen_mask([(recorded(rng, grey, **mask), AT_REST) for _ in range(3)])
 
 
 @pytest.mark.parametrize("scene", [strokes, discs])
 @pytest.mark.parametrize(("amount", "radius_px"), [(0.4, 1.0), (0.7, 1.3), (1.0, 1.1)])
-def test_a_mask_is_seen(rng, scene, amount, radius_px):
-    """At the frequencies at which pictures have detail its gain comes back to a third."""
+def test_a_mask_is_detected(rng, scene, amount, radius_px):
+    """Its gain is right within a third at frequencies at which pictures have detail."""
     mask = seen(rng, scene, amount=amount, radius_px=radius_px)
     assert mask is not None
     for frequency in (0.15, 0.3):
@@ -75,41 +75,41 @@ def test_a_mask_is_seen(rng, scene, amount, radius_px):
 
 
 def with_tails(rng):
-    """A picture of which three fifths are soft and hazy: there an edge comes up to its plateau slowly."""
+    """A picture with 60 % soft and hazy area, where an edge approaches its plateau slowly."""
     sharp = discs(rng)
     hazy = 0.75 * cv2.GaussianBlur(sharp, (0, 0), 0.8) + 0.25 * cv2.GaussianBlur(sharp, (0, 0), 4.0)
     return np.where(np.arange(SIZE) < 0.6 * SIZE, hazy, sharp)
 
 
-def test_a_mask_is_seen_among_soft_edges(rng):
-    """Most edges hide it in their tails; the sharpest tell."""
+def test_a_mask_is_detected_among_soft_edges(rng):
+    """Most edges hide it in their tails; the sharpest ones reveal it."""
     mask = seen(rng, with_tails, amount=0.8, radius_px=1.0)
     assert mask is not None
     assert mask.amount * mask.radius_px**2 == pytest.approx(0.8, rel=0.34)
 
 
 @pytest.mark.parametrize("scene", [strokes, discs, with_tails])
-def test_what_nobody_sharpened_has_none(rng, scene):
-    """Print and plain surfaces, in focus and out of focus."""
+def test_an_unsharpened_picture_has_no_mask(rng, scene):
+    """Print and plain surfaces, in focus and defocused."""
     assert seen(rng, scene) is None
     assert seen(rng, lambda r: cv2.GaussianBlur(scene(r), (0, 0), 1.2)) is None
 
 
-def test_a_response_curve_is_no_mask(rng):
-    """A curve bends the two sides of an edge differently, and takes it beyond neither plateau."""
+def test_a_response_curve_is_not_a_mask(rng):
+    """A curve shapes the two sides of an edge differently and exceeds neither plateau."""
     assert seen(rng, lambda r: 255 * (strokes(r) / 255) ** 0.5) is None
 
 
-def test_few_edges_show_nothing(rng):
-    """An even picture has none."""
+def test_without_edges_no_mask_is_detected(rng):
+    """A uniform picture and an empty list give no result."""
     assert seen(rng, lambda r: np.full((SIZE, SIZE), 128.0), amount=0.7) is None
     assert seen_mask([]) is None
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize(("amount", "radius_px"), [(0.5, 1.0), (1.4, 0.8), (1.0, 2.0)])
-def test_a_mask_is_undone(rng, channels, amount, radius_px):
-    """To within rounding, and a colour's differences from luma stay."""
+def test_a_mask_is_reversed(rng, channels, amount, radius_px):
+    """The result is right within rounding, and the differences of colours from luma stay."""
     grey = strokes(rng, bright=170.0, dark=90.0)
     colour = np.stack([grey, grey - 20, grey + 15], -1)
     if channels == 1:
@@ -124,7 +124,7 @@ def test_a_mask_is_undone(rng, channels, amount, radius_px):
 
 
 def test_clipped_light_stays_clipped(rng):
-    """A lamp that was too bright to be measured is not made a measurement; what lies beside it loses its overshoot."""
+    """A clipped highlight is not turned into a measured value; pixels beside it lose their overshoot."""
     colour = np.repeat(strokes(rng, bright=170.0, dark=90.0)[..., None], 3, -1)
     colour[60:90, 70:95] = 900.0
     shown = np.clip(np.rint(masked(colour, 0.8, 1.0)), 0, 255).astype(np.uint8)
@@ -133,8 +133,8 @@ def test_clipped_light_stays_clipped(rng):
     assert np.any(undone != shown)
 
 
-def test_a_doubtful_overshoot_is_undone_in_part():
-    """Between none and what is sure lies what is to be expected, the more the further the sharpest edges overshoot."""
+def test_an_uncertain_overshoot_is_reversed_in_part():
+    """The reversed part grows with the overshoot of the sharpest edges, from none to all."""
     shares = []
     for amount, p_value in ((0.3, 0.2), (0.5, 0.1), (0.6, 0.05), (0.8, 1e-4)):
         profile = _beside_line(np.array([0.8, amount, np.log(1.1), 6.0, 1.0, 0.0]))

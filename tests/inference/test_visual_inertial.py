@@ -1,4 +1,4 @@
-"""Velocity, scale and the accelerometer's faults from tracks before a wall; refused where nothing tells them."""
+"""Velocity, scale and accelerometer errors from tracks in front of a wall, and motions that do not determine them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ SWAYS = {
 
 @lru_cache(maxsize=8)
 def recorded(setup: Sway) -> SwayingCamera:
-    """Make each setup once."""
+    """Make each setup only once."""
     return SwayingCamera(setup)
 
 
 @lru_cache(maxsize=8)
 def aligned(setup: Sway) -> VisualInertialAlignment:
-    """And align it once."""
+    """The alignment of a setup, made only once."""
     camera = recorded(setup)
     return align(camera.observed, camera.imu, camera.profile)
 
@@ -49,15 +49,15 @@ def motions(camera: SwayingCamera, found: VisualInertialAlignment) -> list[tuple
 
 
 def velocity_error(camera: SwayingCamera, found: VisualInertialAlignment) -> float:
-    """rms error over the rms of the true velocity."""
+    """RMS error relative to the RMS of the true velocity."""
     truth = np.array([camera.velocity_cam(s) for s, _ in motions(camera, found)])
     velocity = np.array([motion.velocity_m_s for _, motion in motions(camera, found)])
     return float(np.sqrt(((velocity - truth) ** 2).sum() / (truth**2).sum()))
 
 
 @pytest.mark.parametrize("name", SWAYS)
-def test_velocity_and_depth_come_back_within_their_deviations(name: str) -> None:
-    """A few per cent off, and where the deviations say so; also for frames between the tracked runs."""
+def test_velocity_and_depth_are_recovered_within_their_deviations(name: str) -> None:
+    """Errors are below 5 %, also for frames between the tracked runs."""
     camera, found = recorded(SWAYS[name]), aligned(SWAYS[name])
     assert trusted(found), found.refused
     seen = motions(camera, found)
@@ -71,8 +71,8 @@ def test_velocity_and_depth_come_back_within_their_deviations(name: str) -> None
     np.testing.assert_allclose([m.depth.depth_m for _, m in seen], depth, rtol=0.05)
 
 
-def test_acceleration_over_a_frame_is_the_mean_one() -> None:
-    """Velocity and acceleration at the reference lead to the velocity at the frame's end, in the reference's axes."""
+def test_the_acceleration_of_a_frame_is_its_mean() -> None:
+    """Velocity and acceleration at the reference give the velocity at the frame's end, in the reference's axes."""
     camera, found = recorded(SWAYS["portrait"]), aligned(SWAYS["portrait"])
     for start_s, motion in motions(camera, found):
         end = camera.orientation(start_s + 0.013).inv() * camera.orientation(start_s + 0.04)
@@ -85,8 +85,8 @@ def scene_stds(stretch: Stretch) -> list[NDArray[np.float64]]:
     return np.split(np.sqrt(np.diag(stretch.fit.covariance)[len(stretch.fit.change) :][:7]), [3, 6])
 
 
-def test_gravity_less_the_bias_is_what_rests_on_the_accelerometer() -> None:
-    """Apart the two are hardly told by so little turning, and the deviations say so; together they are."""
+def test_gravity_and_bias_are_determined_together() -> None:
+    """Little rotation hardly separates them, as their deviations show; their difference is accurate."""
     camera, found = recorded(SWAYS["portrait"]), aligned(SWAYS["portrait"])
     stretch = found.stretches[0]
     gravity, bias = stretch.scene.gravity_m_s2, stretch.scene.accel_bias_m_s2
@@ -101,8 +101,8 @@ def test_gravity_less_the_bias_is_what_rests_on_the_accelerometer() -> None:
     np.testing.assert_allclose(to_imu @ -gravity + bias, true_rest + camera.setup.accel_bias_m_s2, atol=0.04)
 
 
-def test_accelerations_a_sample_late_do_not_matter() -> None:
-    """The delay is found, and velocity and scale stay what they were."""
+def test_an_accelerometer_delay_is_found() -> None:
+    """The delay is estimated, and the velocity stays accurate."""
     late = replace(SWAYS["portrait"], accel_delay_s=0.005)
     found = aligned(late)
     *_, std_s = scene_stds(found.stretches[0])
@@ -110,8 +110,8 @@ def test_accelerations_a_sample_late_do_not_matter() -> None:
     assert velocity_error(recorded(late), found) < 0.05
 
 
-def test_a_profile_that_is_a_little_off_does_not_pass_for_parallax() -> None:
-    """A mounting off by two degrees and an offset off by 8 ms are fitted along; the clock says what it should be."""
+def test_a_slightly_wrong_profile_is_not_mistaken_for_parallax() -> None:
+    """A mounting off by 2° and an offset off by 8 ms are fitted too, and the right offset is reported."""
     camera = recorded(SWAYS["portrait"])
     off = replace(turned_aside(camera.profile, 0.025), time_offset_s=0.005)
     found = align(camera.observed, camera.imu, off)
@@ -136,8 +136,8 @@ REFUSED: dict[str, tuple[Sway, str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_the_motion_does_not_determine_is_refused_with_the_reason(name: str) -> None:
-    """No window is trusted, every frame gets the reason, and nothing pretends to be a velocity."""
+def test_undetermined_motion_is_refused_with_a_reason(name: str) -> None:
+    """No window is trusted, and every frame has the reason instead of a velocity."""
     setup, reason = REFUSED[name]
     found = aligned(setup)
     assert not trusted(found)
@@ -150,7 +150,7 @@ def test_what_the_motion_does_not_determine_is_refused_with_the_reason(name: str
 
 @pytest.mark.parametrize("shift", [197, -150])
 def test_an_accelerometer_of_another_time_is_refused(shift: int) -> None:
-    """Accelerations that belong elsewhere in the recording do not make a scale."""
+    """Accelerations from elsewhere in the recording determine no scale."""
     camera = recorded(SWAYS["portrait"])
     imu = ImuSamples(camera.imu.time_s, camera.imu.gyro_rad_s, np.roll(camera.imu.accel_m_s2, shift, axis=0))
     found = align(camera.observed, imu, camera.profile)
@@ -158,8 +158,8 @@ def test_an_accelerometer_of_another_time_is_refused(shift: int) -> None:
     assert found.refused
 
 
-def test_steady_travel_is_known_over_depth() -> None:
-    """Metres are refused with the reason; velocity over depth, which pictures show, is right, and so is the clock."""
+def test_steady_translation_is_known_relative_to_depth() -> None:
+    """Metres are refused with a reason; velocity over depth and the clock offset are right."""
     camera, found = recorded(STEADY), aligned(STEADY)
     assert not trusted(found)
     assert "scale undetermined" in found.refused
@@ -175,8 +175,8 @@ def test_steady_travel_is_known_over_depth() -> None:
     assert clock[0] == pytest.approx(STEADY.time_offset_s, abs=3 * clock[1])
 
 
-def test_little_travel_is_known_in_metres() -> None:
-    """What IMU rotation, gravity and bias share must not pass for doubt of the velocity: a slow sway is told well."""
+def test_slow_sway_is_known_in_metres() -> None:
+    """The common uncertainty of IMU rotation, gravity and bias does not count as uncertainty of the velocity."""
     slow = Sway(seed=8, sway_m=0.015, depth_m=0.7, rate_rad_s=0.3)
     found = aligned(slow)
     assert trusted(found), found.refused
@@ -184,8 +184,8 @@ def test_little_travel_is_known_in_metres() -> None:
     assert all(window.velocity_std < 0.1 for window in found.windows)
 
 
-def test_a_foreign_recording_is_not_bent_until_it_fits() -> None:
-    """Inertial data of another hand make neither metres nor travel over depth."""
+def test_an_unrelated_recording_is_refused() -> None:
+    """Inertial data of another motion give neither metres nor velocity over depth."""
     camera, other = recorded(SWAYS["portrait"]), recorded(replace(STEADY, seed=11))
     for profile in (camera.profile, replace(camera.profile, time_offset_s=None)):
         found = align(camera.observed, other.imu, profile)
@@ -194,8 +194,8 @@ def test_a_foreign_recording_is_not_bent_until_it_fits() -> None:
         assert found.clock() is None
 
 
-def test_a_stated_depth_gives_steady_travel_its_scale() -> None:
-    """Without any acceleration the velocity is then known too."""
+def test_a_given_depth_determines_the_scale_of_steady_translation() -> None:
+    """The velocity is then known without any acceleration."""
     camera = recorded(STEADY)
     found = align(camera.observed, camera.imu, camera.profile, depth_m=1.8)
     assert trusted(found), found.refused
@@ -203,7 +203,7 @@ def test_a_stated_depth_gives_steady_travel_its_scale() -> None:
 
 
 def test_without_a_focal_length_or_points_nothing_is_fitted() -> None:
-    """The reason is said, and nothing raised."""
+    """A reason is returned and no error is raised."""
     camera = recorded(SWAYS["portrait"])
     blind: CameraProfile = replace(camera.profile, intrinsics=None)
     assert "focal length" in align(camera.observed, camera.imu, blind).refused
@@ -211,8 +211,8 @@ def test_without_a_focal_length_or_points_nothing_is_fitted() -> None:
     assert "3 pairs" in align(few, camera.imu, camera.profile).refused
 
 
-def test_long_captures_are_cut_into_stretches_and_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each with its own velocity; frames between windows have one, frames far from all points have a reason."""
+def test_long_captures_are_divided_into_stretches_and_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each window has a velocity; a frame far from all points has a reason instead."""
     monkeypatch.setattr(visual_inertial, "STRETCH_S", 4.5)
     camera = recorded(Sway(seed=8, frames=255, points=35, runs=tuple(range(10, 245, 21))))
     found = align(camera.observed, camera.imu, camera.profile)
@@ -223,16 +223,16 @@ def test_long_captures_are_cut_into_stretches_and_windows(monkeypatch: pytest.Mo
     assert isinstance(found.frame(20.0, 20.0, 20.03), str)
 
 
-# ── which frames ─────────────────────────────────────────────────────────────────────────────────────────────────
+# ── selection of frames ──────────────────────────────────────────────────────────────────────────────────────────
 
 
 def frames(count: int, without: tuple[int, ...] = ()) -> list[Frame]:
-    """Frames at 30 a second, some of which something speaks against."""
+    """Frames at 30 per second, some of them unusable."""
     return [Frame(k, k, k / 30, skip_reason="no IMU" if k in without else None) for k in range(count)]
 
 
 def test_runs_are_unbroken_and_spread_over_the_capture() -> None:
-    """Of 20 s less than a third is tracked, in runs of consecutive frames, nowhere a second and a half without one."""
+    """From 20 s less than a third is tracked, in runs of consecutive frames less than 1.5 s apart."""
     chosen = choose_runs(frames(600, without=tuple(range(100, 600, 16))))
     assert 150 < len(chosen) < 200
     runs = np.split(np.array(chosen), np.flatnonzero(np.diff(chosen) > 1) + 1)
@@ -241,7 +241,7 @@ def test_runs_are_unbroken_and_spread_over_the_capture() -> None:
     assert not set(chosen) & set(range(100, 600, 16))
 
 
-def test_short_captures_are_tracked_whole() -> None:
-    """And those without a usable frame not at all."""
+def test_short_captures_are_tracked_completely() -> None:
+    """A capture without a usable frame is not tracked."""
     assert choose_runs(frames(20)) == list(range(20))
     assert choose_runs(frames(3, without=(0, 1, 2))) == []

@@ -1,7 +1,7 @@
-"""A camera that sways before a wall, without pictures: tracked points, gyroscope and accelerometer in closed form.
+"""A camera that sways in front of a wall, without frames: tracked points, gyroscope and accelerometer in closed form.
 
-Orientation is synthetic_motion's product of small rotations; position is a sum of sinusoids, differentiated by hand;
-rows are timed anew: nothing of the code under test is used but its records.
+The orientation is the product of small rotations of synthetic_motion; the position is a sum of sinusoids with analytic
+derivatives; row times are computed independently. Only the records of the tested code are used.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ GRAVITY_M_S2 = np.array([1.2, 9.7, -0.8]) * 9.81 / np.linalg.norm([1.2, 9.7, -0.
 
 @dataclass(frozen=True)
 class Sway:
-    """What is recorded, and how."""
+    """The recorded motion and how it is recorded."""
 
     seed: int = 3
     sway_m: float = 0.07
-    """rms length."""
+    """RMS length."""
     velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Steady, on top of the sway."""
+    """Constant, added to the sway."""
     rate_rad_s: float = 0.6
     depth_m: float = 1.8
     normal: tuple[float, float, float] = (-0.25, 0.15, 1.0)
-    """Of the wall, before it is made a unit vector."""
+    """Normal of the wall, before normalisation."""
     relief_m: float = 0.0
-    """Standard deviation of points before and behind the wall."""
+    """Standard deviation of the points' distance from the wall."""
     panel: float | None = None
-    """A panel hangs before part of the wall, at this part of its distance."""
+    """Distance of a panel in front of part of the wall, relative to the wall's distance."""
     accel_bias_m_s2: tuple[float, float, float] = (0.05, -0.08, 0.03)
     accel_delay_s: float = 0.0
     accelerometer: bool = True
     arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The IMU's origin in camera axes."""
+    """Origin of the IMU in camera axes."""
     time_offset_s: float = 0.013
     gyro_bias_rad_s: tuple[float, float, float] = (0.004, -0.006, 0.003)
     frames: int = 90
     runs: tuple[int, ...] = (8, 30, 52, 74)
-    """First frames of runs of RUN frames that are tracked."""
+    """First frames of the tracked runs of RUN frames."""
     points: int = 60
     noise_px: float = 0.15
     exposure_s: float = 0.009
@@ -66,7 +66,7 @@ CENTRE_PX = np.array([233.0, 326.0])
 
 
 class SwayingCamera:
-    """The truth, and what an estimator is given."""
+    """The truth and the estimator's input."""
 
     def __init__(self, setup: Sway) -> None:
         self.setup = setup
@@ -97,7 +97,7 @@ class SwayingCamera:
         )
 
     def position(self, time_s: Array, order: int = 0) -> Array:
-        """Camera's centre (n, 3) or its derivative, world axes; IMU clock (n,)."""
+        """Camera centre (n, 3) or its derivative, world axes; IMU clock (n,)."""
         omega = 2 * np.pi * self._frequency
         angle = omega * np.asarray(time_s)[:, None, None] + self._phase + order * np.pi / 2
         wave = (self._amplitude * omega**order * np.sin(angle)).sum(axis=1)
@@ -110,14 +110,14 @@ class SwayingCamera:
         return self.orientation(time_s).inv().apply(self.position(np.array([time_s]), 1)[0])
 
     def plane(self, camera_s: float) -> Array:
-        """The wall's plane (3,) in camera axes at an instant on the camera's clock: inverse depth of a ray, z = 1."""
+        """The wall's plane (3,) in camera axes at a camera-clock instant: inverse depth of a ray with z = 1."""
         time_s = camera_s + self.setup.time_offset_s
         away = self.distance - self.normal @ self.position(np.array([time_s]))[0]
         return self.orientation(time_s).inv().apply(self.normal) / away
 
     @property
     def observed(self) -> ObservedTracks:
-        """What the tracker makes of it."""
+        """The tracker's observations."""
         assert self.profile.intrinsics is not None
         exposure = np.full(self.setup.frames, self.setup.exposure_s)
         noise = np.full(len(self.pairs), self.setup.noise_px)
@@ -158,7 +158,7 @@ class SwayingCamera:
         return TrackPair(k, k + 1, first_px[inside], (second_px + noise)[inside])
 
     def _along(self, start: Array, way: Array) -> Array:
-        """How many times each way (n, 3) leads to what is seen: the panel where it hangs, or the wall."""
+        """Factors by which directions (n, 3) reach the visible surface: the panel or the wall."""
         wall = (self.distance - start @ self.normal) / (way @ self.normal)
         if self.setup.panel is None:
             return wall
@@ -168,7 +168,7 @@ class SwayingCamera:
         return np.where(hangs, panel, wall)
 
     def inverse_depth(self, camera_s: float, points_px: Array) -> Array:
-        """Of what is seen at pixels (n, 2) at an instant on the camera's clock, along the optical axis."""
+        """Inverse depth along the optical axis at pixels (n, 2) at an instant on the camera's clock."""
         time_s = np.full(len(points_px), camera_s + self.setup.time_offset_s)
         rays = np.concatenate([(points_px - CENTRE_PX) / self.setup.focal_px, np.ones((len(points_px), 1))], axis=1)
         return 1 / self._along(self.position(time_s), self.orientation(time_s).apply(rays))
@@ -180,6 +180,6 @@ class SwayingCamera:
 
 
 def turned_aside(profile: CameraProfile, angle_rad: float) -> CameraProfile:
-    """A profile whose IMU is mounted a little differently from what is true."""
+    """A profile with a slightly wrong mounting of the IMU."""
     matrix = Rotation.from_rotvec([angle_rad, -angle_rad / 2, angle_rad]).as_matrix() @ profile.rotation_cam_imu
     return replace(profile, r_cam_imu=tuple(map(tuple, matrix.tolist())))

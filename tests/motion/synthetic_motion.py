@@ -1,7 +1,7 @@
-"""Captures without pictures: tracked points, stamps and gyroscope samples made straight from an analytic motion.
+"""Captures without frames: tracked points, timestamps and gyroscope samples from an analytic motion.
 
-Orientation here is a product of 5 000 small rotations a second (SciPy), right to 2e-7 rad, row times are worked out
-anew: nothing of the code under test is used but its records.
+The orientation is a product of 5000 small rotations per second (SciPy), accurate to 2e-7 rad; row times are computed
+independently. Only the records of the tested code are used.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
 @dataclass(frozen=True)
 class Motion:
-    """A camera's turning: sums of sines for each axis, a constant rate, and a constant velocity."""
+    """A camera's rotation, as sums of sines for each axis and a constant rate, and a constant velocity."""
 
     amplitude_rad_s: Array
     """(m, 3) camera axes."""
@@ -45,7 +45,7 @@ class Motion:
         return (self.amplitude_rad_s * wave).sum(axis=1) + np.array(self.pan_rad_s)
 
     def orientation(self, first_s: float, last_s: float) -> Slerp:
-        """R_world_cam as a function of time, from 5 000 exact steps a second at the middle rate."""
+        """R_world_cam as a function of time, from 5000 exact steps per second at the middle rate."""
         time_s = np.linspace(first_s, last_s, int((last_s - first_s) * 5_000) + 2)
         step = np.diff(time_s)[:, None]
         steps = Rotation.from_rotvec(self.rate(0.5 * (time_s[1:] + time_s[:-1])) * step).as_matrix()
@@ -57,7 +57,7 @@ class Motion:
 
 
 def hand_motion(seed: int, rate_rad_s: float = 0.5, **changes: object) -> Motion:
-    """Shake of a few hertz with random phases, rms rate as given on each axis."""
+    """Shake of a few hertz with random phases and the given RMS rate on each axis."""
     rng = np.random.default_rng(seed)
     frequency = rng.uniform(0.4, 6.0, (6, 3))
     amplitude = rng.uniform(0.5, 1.0, (6, 3)) / np.sqrt(frequency)
@@ -67,7 +67,7 @@ def hand_motion(seed: int, rate_rad_s: float = 0.5, **changes: object) -> Motion
 
 @dataclass(frozen=True)
 class Setup:
-    """What is recorded, and how."""
+    """The recorded motion and how it is recorded."""
 
     motion: Motion
     time_offset_s: float = 0.0
@@ -86,24 +86,24 @@ class Setup:
     noise_px: float = 0.1
     depth_m: tuple[float, float] = (1.5, 12.0)
     outliers: float = 0.0
-    """Part of the points on an object that moves by itself."""
+    """Part of the points that belong to a moving object."""
     seed: int = 1
 
 
 @dataclass(frozen=True)
 class Synthetic:
-    """Everything an estimator is given."""
+    """The complete input of an estimator."""
 
     pairs: list[TrackPair]
     frame_time_s: Array
     exposure_s: Array
     imu: ImuSamples
     profile: CameraProfile
-    """Knows all but the offset and the bias."""
+    """Contains everything but the offset and the bias."""
     orientation: Slerp = field(repr=False)
 
     def observed(self, profile: CameraProfile | None = None) -> ObservedTracks:
-        """The tracks as a profile sees them; None: the recording's own."""
+        """The tracks for a profile; None selects the recording's own."""
         return observed_pairs(self.pairs, self.frame_time_s, self.exposure_s, profile or self.profile)
 
 
@@ -158,7 +158,7 @@ def _pair(setup: Setup, orientation: Slerp, k: int, frame_time_s: Array, rng: np
 
 
 def _seen_s(setup: Setup, points_px: Array, stamp_s: float) -> Array:
-    """IMU-clock time of the middle of the exposure of the rows through the points."""
+    """Middle of the exposure of the rows through the points, IMU clock."""
     along = {
         "top_to_bottom": points_px[:, 1] / setup.height,
         "bottom_to_top": 1 - (points_px[:, 1] + 1) / setup.height,

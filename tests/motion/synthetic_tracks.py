@@ -1,8 +1,8 @@
-"""A phone in a hand, without pictures: tracked points and inertial samples of a motion known in closed form.
+"""A hand-held phone without frames: tracked points and inertial samples of a motion known in closed form.
 
-Orientation is three angles, position a straight line, both with waves on top: rates and accelerations are derivatives
-by hand.  A point's blurred image is the mean of its path over the exposure (Gauss' three nodes), and its row's time is
-found by fixed-point iteration.  Of the code under test only the records are used.
+The orientation consists of three angles and the position of a straight line, both with added waves, so rates and
+accelerations are analytic derivatives. A point's blurred image is the mean of its path over the exposure (three Gauss
+nodes), and its row's time is found by fixed-point iteration. Only the records of the tested code are used.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ Triple = tuple[float, float, float]
 GRAVITY_M_S2 = np.array([1.2, 9.7, -0.8]) * 9.81 / np.linalg.norm([1.2, 9.7, -0.8])
 NODES, SHARES = np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6), np.array([5.0, 8.0, 5.0]) / 18
 R_CAM_IMU = Rotation.from_euler("ZYX", [1.61, 0.06, -3.05]).as_matrix()
-"""No axis map: about a quarter turn, and some degrees more."""
+"""Not an axis map: about a quarter turn plus some degrees."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What is recorded, and how."""
+    """The recorded motion and how it is recorded."""
 
     seed: int = 1
     rate_rad_s: float = 0.6
     """Typical rate about each axis."""
     about: Triple = (1.0, 1.0, 1.0)
-    """Part of that rate in yaw (about z), pitch (about y), roll (about x)."""
+    """Part of that rate in yaw (about z), pitch (about y) and roll (about x)."""
     sway_m: float = 0.0
     velocity_m_s: Triple = (0.0, 0.0, 0.0)
     plane_per_m: Triple | None = None
-    """m of the wall m · X = 1, seen from the camera's place at the middle; None: no wall."""
+    """m of the wall m · X = 1, relative to the camera's position at the middle; None: no wall."""
     inverse_depth_per_m: tuple[float, float] = (0.0, 0.0)
-    """Without a wall: each point's lies anywhere between; 0 is infinitely far."""
+    """Range of each point's inverse depth without a wall; 0 is infinitely far."""
     width: int = 480
     height: int = 640
     focal_px: float = 520.0
@@ -75,12 +75,12 @@ class Setup:
     timestamp: str = "exposure_start"
     exposure_s: float = 0.008
     exposure_swing: float = 0.3
-    """Exposures vary by this part of themselves."""
+    """Relative variation of the exposures."""
     frames: int = 30
     points: int = 40
     noise_px: float = 0.1
     outliers: float = 0.0
-    """Part of the points on an object that moves by itself."""
+    """Part of the points that belong to a moving object."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Waves:
 
 
 class Recording:
-    """The truth, and what an estimator is given."""
+    """The truth and the estimator's input."""
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
@@ -137,13 +137,13 @@ class Recording:
         )
 
     def position(self, time_s: Array, order: int = 0) -> Array:
-        """Camera's centre (n, 3) or its derivative, world axes."""
+        """Camera centre (n, 3) or its derivative, world axes."""
         steady = np.array(self.setup.velocity_m_s)
         straight = (np.asarray(time_s)[..., None] * steady, steady, 0.0 * steady)[order]
         return self._places.at(time_s, order) + straight
 
     def specific_force(self, time_s: Array) -> Array:
-        """What an accelerometer without faults feels (n, 3), camera axes."""
+        """Specific force (n, 3) at an ideal accelerometer, camera axes."""
         arm, rate, step = np.array(self.setup.arm_m), self.rate(time_s), 1e-4
         turning = (self.rate(time_s + step) - self.rate(time_s - step)) / (2 * step)
         force = self.orientation(time_s).inv().apply(self.position(time_s, 2) - GRAVITY_M_S2)
@@ -153,7 +153,7 @@ class Recording:
 
     @cached_property
     def imu(self) -> ImuSamples:
-        """Gyroscope and accelerometer at 210 Hz, from a second before the first stamp to one after the last."""
+        """Gyroscope and accelerometer at 210 Hz, from 1 s before the first timestamp to 1 s after the last."""
         setup, to_imu = self.setup, np.array(self.setup.r_cam_imu)
         time_s = np.arange(-1.0, self.stamp_s[-1] + 1.0, 1 / 210) + setup.time_offset_s
         gyro = setup.gyro_scale * self._passed_rate(time_s) @ to_imu + np.array(setup.gyro_bias_rad_s)
@@ -162,7 +162,7 @@ class Recording:
         return ImuSamples(time_s, gyro, force if setup.accelerometer else np.full_like(force, np.nan))
 
     def _passed_rate(self, time_s: Array) -> Array:
-        """Rates (n, 3) behind the gyroscope's low pass, in steps of 0.1 ms by the trapezoidal rule."""
+        """Rates (n, 3) after the gyroscope's low-pass filter, in steps of 0.1 ms by the trapezoidal rule."""
         cutoff_hz, step_s = self.setup.gyro_lowpass_hz, 1e-4
         if not cutoff_hz:
             return self.rate(time_s)
@@ -174,7 +174,7 @@ class Recording:
 
     @cached_property
     def profile(self) -> CameraProfile:
-        """All that is true of the phone."""
+        """The phone's true profile."""
         s = self.setup
         focal_px = s.focal_px, s.focal_px * s.pixel_aspect
         lens = Intrinsics(s.width, s.height, *focal_px, *s.centre_px)
@@ -218,7 +218,7 @@ class Recording:
 
     @property
     def observed(self) -> ObservedTracks:
-        """What an estimator's front makes of the pairs."""
+        """The pairs as an estimator's input."""
         assert self.profile.intrinsics is not None
         noise_px = np.full(len(self.pairs), max(self.setup.noise_px, 0.02))
         return ObservedTracks(tuple(self.pairs), self.stamp_s, self.exposure_s, True, noise_px, self.profile.intrinsics)
@@ -243,7 +243,7 @@ class Recording:
         )
 
     def turns(self, offset_s: float = 0.0) -> FrameRotations:
-        """Rotation of every pair at its middle row, stamps counted from another zero, without looking at points."""
+        """Rotation of every pair at its middle row, computed without points; timestamps may have another zero."""
         s = self.setup
         middle = np.array([[(s.width - 1) / 2, (s.height - 1) / 2]])
         seen = np.concatenate([self.seen_s(middle, np.array([k])) for k in range(s.frames)])
@@ -252,11 +252,11 @@ class Recording:
         return FrameRotations(camera_s[:-1], camera_s[1:], (after.inv() * before).as_rotvec())
 
     def in_trajectory_axes(self, vectors: Array) -> Array:
-        """Turn world vectors into the camera's axes at the first inertial sample."""
+        """Rotate world vectors into the camera's axes at the first inertial sample."""
         return self.orientation(self.imu.time_s[:1])[0].inv().apply(vectors)
 
     def seen_s(self, points_px: Array, frame: NDArray[np.intp]) -> Array:
-        """IMU clock of the middle of the exposure of the rows through the points (n, 2) of frames (n,)."""
+        """Middle of the exposure of the rows through points (n, 2) of frames (n,), IMU clock."""
         s = self.setup
         along = {
             "top_to_bottom": points_px[:, 1] / s.height,
@@ -270,7 +270,7 @@ class Recording:
 
     @cached_property
     def _shift(self) -> tuple[Array, Array]:
-        """The stabiliser's shift (m, 2) in units of the focal length: a high-pass in steps of 0.2 ms."""
+        """The stabiliser's shift (m, 2) in units of the focal length: a high-pass filter in steps of 0.2 ms."""
         fraction, cutoff_hz = self.setup.stabilised
         time_s = np.arange(self.imu.time_s[0], self.imu.time_s[-1], 2e-4)
         decay = np.exp(-2 * np.pi * cutoff_hz * 2e-4)
@@ -311,5 +311,5 @@ class Recording:
 
 @lru_cache(maxsize=16)
 def recorded(setup: Setup) -> Recording:
-    """Make each recording once."""
+    """Make each recording only once."""
     return Recording(setup)

@@ -1,4 +1,4 @@
-"""The accelerometer's path against paths known in closed form, and how it depends on bias and delay."""
+"""The accelerometer's path compared with paths in closed form, and its dependence on bias and delay."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ TIMES_S, ORIGIN_S = np.array([0.213, 0.55, 0.8, 1.131]), np.full(4, 0.62)
 
 
 def displacement(imu: ImuSamples, profile: CameraProfile) -> Displacement:
-    """Integrate, with an accelerometer that must be there."""
+    """Integrate; an accelerometer is required."""
     found = integrate_accelerometer(imu, profile, integrate_gyro(imu, profile))
     assert found is not None
     return found
 
 
 def with_forces(recording: Recording, change: np.ndarray) -> ImuSamples:
-    """The recording's samples with other accelerations."""
+    """The recording's samples with changed accelerations."""
     return replace(recording.imu, accel_m_s2=recording.imu.accel_m_s2 + change)
 
 
-def test_constant_acceleration_felt_by_a_turning_sensor_is_a_parabola() -> None:
-    """½ a t² to a nanometre from any origin, however the sensor turns and sits, samples at uneven times."""
+def test_constant_acceleration_of_a_rotating_sensor_gives_a_parabola() -> None:
+    """½ a t² is accurate to 1 nm from any origin, for any mounting and uneven sample times."""
     rng = np.random.default_rng(8)
     time_s = -0.3 + np.cumsum(rng.uniform(0.003, 0.007, 400))
     r_cam_imu = Rotation.from_rotvec([0.4, -1.9, 0.7])
@@ -47,8 +47,8 @@ def test_constant_acceleration_felt_by_a_turning_sensor_is_a_parabola() -> None:
     np.testing.assert_allclose(path.acceleration(TIMES_S), np.tile(acceleration, (4, 1)), atol=1e-7)
 
 
-def test_path_of_a_swaying_hand_is_found_from_its_true_unknowns() -> None:
-    """Velocity, gravity, bias and lever arm put together with the accelerations give the true path to 0.1 mm."""
+def test_the_path_of_a_swaying_hand_follows_from_true_parameters() -> None:
+    """Velocity, gravity, bias and lever arm together with the accelerations give the true path within 0.1 mm."""
     recording = recorded(SWAYING)
     scene = recording.scene(recording.table())
     origin_s = float(recording.profile.imu_time_s(recording.table().origin_s)[0])
@@ -60,8 +60,8 @@ def test_path_of_a_swaying_hand_is_found_from_its_true_unknowns() -> None:
     np.testing.assert_allclose(found, recording.in_trajectory_axes(truth), atol=1e-4)
 
 
-def test_bias_slope_is_the_change_that_a_bias_makes() -> None:
-    """Adding b to every acceleration moves the path by B b, exactly."""
+def test_the_bias_derivative_is_the_effect_of_a_bias() -> None:
+    """Adding b to every acceleration moves the path by exactly B b."""
     recording = recorded(SWAYING)
     bias = np.array([0.4, -0.9, 0.2])
     plain = displacement(recording.imu, recording.profile).at(TIMES_S, ORIGIN_S)
@@ -70,8 +70,8 @@ def test_bias_slope_is_the_change_that_a_bias_makes() -> None:
     assert np.abs(plain[1] @ bias).max() > 0.05
 
 
-def test_delay_slope_undoes_a_small_delay() -> None:
-    """Accelerations 2 ms older than their stamps, put right to first order, leave a tenth of the damage and less."""
+def test_the_delay_derivative_corrects_a_small_delay() -> None:
+    """A delay of 2 ms, corrected to first order, leaves less than a tenth of its error."""
     prompt, late = recorded(SWAYING), recorded(replace(SWAYING, accel_delay_s=0.002))
     truth = displacement(prompt.imu, prompt.profile).at(TIMES_S, ORIGIN_S)[0]
     wrong, _, slope = displacement(late.imu, late.profile).at(TIMES_S, ORIGIN_S)
@@ -80,8 +80,8 @@ def test_delay_slope_undoes_a_small_delay() -> None:
     assert np.abs(wrong + 0.002 * slope - truth).max() < 0.1 * damage
 
 
-def test_path_begins_at_rest_at_its_origin() -> None:
-    """P, B and the delay's slope and their rates are nought at the origin, and the arm turns with the camera."""
+def test_the_path_starts_at_rest_at_its_origin() -> None:
+    """The path and its derivatives are zero at the origin, and the lever arm rotates with the camera."""
     path = displacement(recorded(SWAYING).imu, recorded(SWAYING).profile)
     for part in path.at(np.array([0.62]), np.array([0.62])):
         np.testing.assert_allclose(part, 0, atol=1e-12)
@@ -93,8 +93,8 @@ def test_path_begins_at_rest_at_its_origin() -> None:
 
 
 @pytest.mark.parametrize(("missing", "bridged"), [(3, True), (30, False)])
-def test_few_holes_are_bridged_and_many_refused(missing: int, bridged: bool) -> None:
-    """Rows without an acceleration: one in a hundred does no harm, one in twelve leaves no path."""
+def test_few_gaps_are_bridged_and_many_refused(missing: int, bridged: bool) -> None:
+    """One row in a hundred without an acceleration does no harm; one in twelve leaves no path."""
     recording = recorded(SWAYING)
     hole = np.zeros((len(recording.imu), 1))
     hole[np.random.default_rng(2).choice(len(hole), missing, replace=False)] = np.nan
@@ -107,8 +107,8 @@ def test_few_holes_are_bridged_and_many_refused(missing: int, bridged: bool) -> 
         np.testing.assert_allclose(found.at(TIMES_S, ORIGIN_S)[0], whole, atol=1e-3)
 
 
-def test_camera_at_rest_feels_gravity_only() -> None:
-    """At rest the specific force is minus gravity, whatever the mounting."""
+def test_a_camera_at_rest_measures_only_gravity() -> None:
+    """At rest the specific force is minus gravity."""
     recording = recorded(replace(SWAYING, rate_rad_s=0.0, sway_m=0.0, accel_bias_m_s2=(0.0, 0.0, 0.0)))
     force = displacement(recording.imu, recording.profile).acceleration(TIMES_S)
     np.testing.assert_allclose(force, -np.tile(recording.in_trajectory_axes(GRAVITY_M_S2), (4, 1)), atol=1e-2)

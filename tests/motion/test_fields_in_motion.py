@@ -1,4 +1,4 @@
-"""Fields of focal length and rate, as the trajectory, the moving lens and the simulator take them."""
+"""Fields of focal length, rate, delay and blur in the trajectory, the moving lens and the simulator."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ FIELDS = (
 
 
 def log() -> ImuSamples:
-    """A second of turns and forces."""
+    """One second of rotation and forces."""
     time_s = np.arange(0.0, 1.0, 0.005)
     rate = np.stack([1.7 * np.sin(7 * time_s), 0.6 * np.cos(4 * time_s), 0.4 * np.sin(3 * time_s)], axis=-1)
     force = np.stack([np.sin(5 * time_s), 9.0 + 0.0 * time_s, 3 * np.cos(2 * time_s)], axis=-1)
     return ImuSamples(time_s, rate, force)
 
 
-def test_a_rate_field_turns_the_trajectory() -> None:
-    """The camera's rate is R (measured less bias over scale, plus the fields), sample by sample."""
+def test_a_rate_field_is_added_to_the_trajectory() -> None:
+    """The camera's rate is R ((measured − bias) / scale + fields), sample by sample."""
     imu, profile = log(), CAMERA.with_fields(FIELDS)
     added = missing_rate_rad_s(imu, profile)
     assert added is not None
@@ -57,7 +57,7 @@ def test_a_rate_field_turns_the_trajectory() -> None:
     assert float(np.abs(added).max()) > 0.1
 
 
-def test_the_simulated_gyroscope_reads_what_the_fields_take_back() -> None:
+def test_rate_fields_invert_the_simulated_gyroscope() -> None:
     """Simulator and trajectory agree: true rate → reading → true rate."""
     imu, profile = log(), CAMERA.with_fields(FIELDS)
     reading = gyro_reading(profile, imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
@@ -69,8 +69,8 @@ def test_the_simulated_gyroscope_reads_what_the_fields_take_back() -> None:
 
 
 @pytest.mark.parametrize("fields", [(ZOOM,), (ZOOM, OUTWARDS)])
-def test_a_scale_field_lengthens_the_focal_length_in_lens_and_simulator_alike(fields: tuple[Field, ...]) -> None:
-    """Rays and projection are inverse at any time, and the simulator looks along the same rays."""
+def test_a_scale_field_is_the_same_in_lens_and_simulator(fields: tuple[Field, ...]) -> None:
+    """Projection inverts rays at any time, and the simulator uses the same rays."""
     imu, profile = log(), CAMERA.with_fields(fields)
     lens = moving_lens(integrate_gyro(imu, profile), profile)
     points = np.array([[10.0, 20.0], [150.0, 111.0]])
@@ -85,8 +85,8 @@ def test_a_scale_field_lengthens_the_focal_length_in_lens_and_simulator_alike(fi
     assert (x[111, 150], y[111, 150]) == pytest.approx(tuple(seen[:2]), abs=1e-5)
 
 
-def test_rows_start_late_in_the_simulator_too() -> None:
-    """The same delay of the same row."""
+def test_a_row_delay_is_the_same_in_the_simulator() -> None:
+    """The simulator delays each row as the profile does."""
     late = Field("delay", ("row",), ((0.0, 0.5, 1.0),), ((0.0,), (0.003,), (0.001,)))
     profile = CAMERA.with_fields([late])
     fraction = np.arange(120) / 120
@@ -95,8 +95,8 @@ def test_rows_start_late_in_the_simulator_too() -> None:
     assert late_rows_s(profile, NOTHING, fraction, 0.0) == pytest.approx(seen_s)
 
 
-def test_rows_that_start_late_in_some_frames_do_so_in_a_frame_and_in_the_simulator() -> None:
-    """One delay by row and time: the clock of all points, that of one frame, and the simulator's."""
+def test_a_delay_over_row_and_time_is_the_same_everywhere() -> None:
+    """The clock of points, the motion of a frame and the simulator have the same delay."""
     rows = Field("delay", ("row",), ((0.0, 1.0),), ((0.0,), (0.002,)))
     later = tuple((0.003 * r * r * t,) for r in (0.0, 0.5, 1.0) for t in (0.0, 1.0))
     profile = CAMERA.with_fields([rows, Field("delay", ("row", "time"), ((0.0, 0.5, 1.0), (0.0, 1.0)), later)])
@@ -110,8 +110,8 @@ def test_rows_that_start_late_in_some_frames_do_so_in_a_frame_and_in_the_simulat
     assert late_rows_s(profile, NOTHING, fraction, stamp_s) == pytest.approx(late_s, abs=1e-9)
 
 
-def test_a_simulated_frame_is_out_of_focus_when_its_field_says_so() -> None:
-    """A point spreads by the field's deviation at the frame's stamp; in corners alone where that is hidden."""
+def test_a_simulated_frame_has_the_blur_of_its_field() -> None:
+    """A point spreads by the field's deviation at the frame's timestamp; a hidden corner blur affects only corners."""
     blur = Field("blur", ("time",), ((0.0, 1.0),), ((0.0,), (3.0,)), (), 0)
     light = np.zeros((121, 161, 3), np.float32)
     light[[60, 20], [80, 20]] = 1.0

@@ -1,4 +1,4 @@
-"""Integration of angular rate against a brute-force product of small rotations."""
+"""Integration of angular rates compared with a brute-force product of small rotations."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ PROFILE = CameraProfile(64, 48, r_cam_imu=R_CAM_IMU, gyro_bias_rad_s=(0.01, -0.0
 
 
 def recorded(time_s: np.ndarray) -> ImuSamples:
-    """Tell what the gyroscope of PROFILE would say of MOTION: scale x true + bias, IMU axes."""
+    """Readings of PROFILE's gyroscope for MOTION: scale × true + bias, IMU axes."""
     true_imu = MOTION.rate(time_s) @ np.array(R_CAM_IMU)
     gyro = true_imu * PROFILE.gyro_scale + PROFILE.gyro_bias_rad_s
     return ImuSamples(time_s, gyro, np.full_like(gyro, np.nan))
 
 
 def angle_between(matrices: np.ndarray, truth: Rotation) -> float:
-    """Largest angle, rad, between rotations that both begin at the first time."""
+    """Largest angle in rad between rotations, relative to the first time."""
     own = Rotation.from_matrix(matrices)
     return float(((own[0].inv() * own).inv() * (truth[0].inv() * truth)).magnitude().max())
 
 
 @pytest.mark.parametrize("jitter_s", [0.0, 4e-4])
-def test_partial_intervals_are_integrated_exactly(jitter_s: float) -> None:
-    """Between any two instants, on samples or not, the turn is that of a fine brute force to 1e-6 rad (400 Hz)."""
+def test_partial_intervals_are_integrated_accurately(jitter_s: float) -> None:
+    """Between any two instants, on samples or not, the rotation is accurate to 1e-6 rad at 400 Hz."""
     rng = np.random.default_rng(7)
     time_s = np.arange(-0.1, 1.1, 1 / 400)
     imu = recorded(time_s + rng.uniform(-jitter_s, jitter_s, len(time_s)))
@@ -47,8 +47,8 @@ def test_partial_intervals_are_integrated_exactly(jitter_s: float) -> None:
     assert angle_between(integrate_gyro(imu, PROFILE).orientation(query_s), truth) < 1e-6
 
 
-def test_rate_is_the_analytic_one() -> None:
-    """Bias, scale and axes are undone, also between samples."""
+def test_the_rate_matches_the_analytic_rate() -> None:
+    """Bias, scale and axes are corrected, also between samples."""
     imu = recorded(np.arange(0, 1, 1 / 400))
     trajectory = integrate_gyro(imu, PROFILE)
     np.testing.assert_allclose(trajectory.rate_rad_s(imu.time_s), MOTION.rate(imu.time_s), atol=1e-12)
@@ -57,8 +57,8 @@ def test_rate_is_the_analytic_one() -> None:
 
 
 @pytest.mark.parametrize("samples", [2, 3, 4, 5, 8, 9, 64, 157])
-def test_steps_are_multiplied_up_in_order(samples: int) -> None:
-    """The turns at the samples are those of one step after another, for odd and even numbers of them."""
+def test_steps_are_multiplied_in_order(samples: int) -> None:
+    """Rotations at the samples equal the product of single steps, for odd and even counts."""
     imu = recorded(np.arange(samples) * 0.02)
     found = integrate_gyro(imu, PROFILE, measured_rate(imu))
     a, b, c, d = np.swapaxes(found.rate_polynomials, 1, 2) * np.array([1 / 4, 1 / 3, 1 / 2, 1.0])[:, None, None]
@@ -72,7 +72,7 @@ def test_steps_are_multiplied_up_in_order(samples: int) -> None:
 
 
 def test_a_gap_is_bridged_by_a_straight_line() -> None:
-    """Across a pause in the samples the rate runs straight and does not swing; beyond it all is as before."""
+    """Across a gap in the samples the rate is linear without oscillation, and integration stays accurate after it."""
     time_s = np.concatenate([np.arange(0, 0.4, 0.005), np.arange(0.5, 1, 0.005)])
     imu = recorded(time_s)
     trajectory = integrate_gyro(imu, PROFILE)

@@ -1,4 +1,4 @@
-"""The rate behind a gyroscope's low pass: exact without noise, held back where there is nothing but noise."""
+"""The rate before a gyroscope's low-pass filter: exact without noise, regularised with noise."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ CUTOFF_HZ = 10.0
 
 
 def measured(rate: np.ndarray) -> MeasuredRate:
-    """One rate on all three axes."""
+    """The same rate on all three axes."""
     gyro = np.stack([rate] * 3, axis=1)
     return measured_rate(ImuSamples(TIME_S, gyro, np.full_like(gyro, np.nan)))
 
 
 def filtered(frequency_hz: float) -> np.ndarray:
-    """What the filter makes of cos(2π f t): its response by hand, H = 1 / (1 − x² + i √2 x) with x = f / cutoff."""
+    """The filter's output for cos(2π f t), with the response H = 1 / (1 − x² + i √2 x) and x = f / cutoff."""
     x = frequency_hz / CUTOFF_HZ
     return np.real(np.exp(2j * np.pi * frequency_hz * TIME_S) / (1 - x**2 + 1j * np.sqrt(2) * x))
 
 
 @pytest.mark.parametrize("frequency_hz", [1.0, 4.0, 9.0])
-def test_a_filtered_rate_is_turned_back(frequency_hz: float) -> None:
-    """To the cosine that it was, at samples inside the log."""
+def test_a_low_pass_is_inverted(frequency_hz: float) -> None:
+    """The original cosine is recovered at samples inside the log."""
     pieces = measured(filtered(frequency_hz)).behind_low_pass(CUTOFF_HZ)
     true = np.cos(2 * np.pi * frequency_hz * TIME_S)
     np.testing.assert_allclose(pieces[3, 0, 80:-80], true[80:-81], atol=0.02)
 
 
-def test_no_filter_and_one_far_away_change_nothing() -> None:
-    """Cutoff 0 is none; at 10 kHz a rate of 4 Hz is late by 1e-4 of a radian."""
+def test_no_filter_or_a_high_cutoff_changes_nothing() -> None:
+    """A cutoff of 0 means no filter; at 10 kHz a rate of 4 Hz hardly changes."""
     rate = measured(filtered(4.0))
     assert rate.behind_low_pass(0.0) is rate.pieces
     np.testing.assert_allclose(rate.behind_low_pass(1e4)[3], rate.pieces[3], atol=1e-3)
 
 
-def test_noise_is_not_enlarged_as_the_rate_is() -> None:
-    """White noise of 0.01 rad/s on top: a bare inverse enlarges it a hundred times at 100 Hz."""
+def test_inverting_the_filter_hardly_amplifies_noise() -> None:
+    """With white noise of 0.01 rad/s, a plain inverse amplifies noise 100 times at 100 Hz."""
     noise = np.random.default_rng(5).normal(0, 0.01, len(TIME_S))
     clean, noisy = (measured(filtered(3.0) + n).behind_low_pass(CUTOFF_HZ)[3, 0] for n in (0 * noise, noise))
     spline, delay = CubicSpline(TIME_S, noise), delay_s(CUTOFF_HZ)
@@ -50,16 +50,16 @@ def test_noise_is_not_enlarged_as_the_rate_is() -> None:
     assert np.std((noisy - clean)[40:-40]) < 0.1 * np.std(bare[40:-40])
 
 
-def test_noise_alone_goes_and_a_rate_stays(rng: np.random.Generator) -> None:
-    """Of pure noise hardly any is left; a turn ten times above it keeps all but a few hundredths."""
+def test_noise_is_removed_and_a_rate_is_kept(rng: np.random.Generator) -> None:
+    """Pure noise is mostly removed; a rate ten times larger is kept within a few percent."""
     noise = rng.normal(0, 0.01, (600, 1))
     assert without_noise(noise).std() < 0.005
     rate = 0.1 * np.cos(2 * np.pi * 3.0 * TIME_S)[:, None]
     assert (without_noise(rate + noise) - rate).std() < 0.005
 
 
-def test_cutoff_and_delay_are_each_others_inverse() -> None:
-    """40 Hz delays by 5.6 ms; 0 stands for no filter on both sides."""
+def test_cutoff_and_delay_are_inverse_functions() -> None:
+    """40 Hz gives a delay of 5.6 ms; 0 means no filter for both."""
     assert delay_s(40.0) == pytest.approx(5.627e-3, rel=1e-3)
     assert cutoff_hz(delay_s(17.0)) == pytest.approx(17.0)
     assert delay_s(0.0) == cutoff_hz(0.0) == 0.0

@@ -1,4 +1,7 @@
-"""The moving lens: focal drift and stabiliser, by hand, against an ODE, and against the simulator's own rays."""
+"""The moving lens.
+
+Focal drift and stabiliser, compared with hand calculations, an ODE solver, and the simulator's rays.
+"""
 
 from __future__ import annotations
 
@@ -25,24 +28,24 @@ HAND = random_hand_motion(np.random.default_rng(5), rate_rms_rad_s=1.5, duration
 
 
 def extended(profile: CameraProfile, **extensions: float) -> CameraProfile:
-    """The profile with extensions set."""
+    """The profile with the given extensions."""
     return replace(profile, extensions=replace(profile.extensions, **extensions))
 
 
 def sampled(hand: HandMotion, profile: CameraProfile, start_s: float, end_s: float) -> Trajectory:
-    """What a gyroscope makes of a simulated hand."""
+    """Trajectory integrated from the gyroscope of a simulated hand motion."""
     time_s = np.arange(start_s, end_s, 0.002)
     measured = hand.rate_rad_s(time_s) @ profile.rotation_cam_imu * profile.gyro_scale + profile.gyro_bias_rad_s
     return integrate_gyro(ImuSamples(time_s, measured, np.full((len(time_s), 3), np.nan)), profile)
 
 
 def pixels() -> NDArray[np.float64]:
-    """Points inside a picture 200 wide and 136 high."""
+    """Points inside a frame of 200 × 136."""
     return np.random.default_rng(3).uniform((0, 0), (199, 135), (30, 2))
 
 
-def test_a_steady_turn_worked_by_hand() -> None:
-    """At 0.5 Hz θ(1 s) = ω (1 − e^(−π)) / π = 0.3046 ω; x moves by +0.6 θ_y, y by −0.6 θ_x."""
+def test_steady_rotation_matches_a_hand_calculation() -> None:
+    """At 0.5 Hz, θ(1 s) = ω (1 − e^(−π)) / π = 0.3046 ω; x moves by +0.6 θ_y, y by −0.6 θ_x."""
     time_s = np.array([0.3, 0.31, 0.7, 1.3, 1.301])
     rate = np.tile([-0.25, 0.4, 2.0], (5, 1))
     shift = stabiliser_shift(time_s, rate, fraction=0.6, cutoff_hz=0.5)
@@ -52,7 +55,7 @@ def test_a_steady_turn_worked_by_hand() -> None:
 
 
 def test_the_shift_solves_the_high_pass() -> None:
-    """For rates that are linear between uneven times it is θ' = ω − 2π cutoff θ to the ODE solver's own precision."""
+    """For rates linear between uneven times, it solves θ' = ω − 2π cutoff θ as accurately as an ODE solver."""
     rng = np.random.default_rng(8)
     time_s = np.cumsum(rng.uniform(0.001, 0.02, 60))
     rate = rng.normal(size=(60, 3))
@@ -68,16 +71,16 @@ def test_the_shift_solves_the_high_pass() -> None:
     np.testing.assert_allclose(stabiliser_shift(time_s, rate, -0.8, 1.7), expected, atol=1e-10)
 
 
-def test_a_cutoff_near_zero_leaves_the_whole_turn() -> None:
-    """Without a high-pass the shift is the plain integral of the rate."""
+def test_a_cutoff_near_zero_keeps_the_complete_rotation() -> None:
+    """Without the high-pass filter the shift is the plain integral of the rate."""
     time_s = np.linspace(0, 1, 11)
     rate = np.stack([time_s, 2 - time_s, time_s * 0], -1)
     shift = stabiliser_shift(time_s, rate, 1.0, 1e-7)
     np.testing.assert_allclose(shift, np.stack([2 * time_s - time_s**2 / 2, -(time_s**2) / 2], -1), atol=1e-5)
 
 
-def test_the_start_is_forgotten_after_the_settling_time() -> None:
-    """A log that begins a settling time before a picture puts the stabiliser where the whole log puts it."""
+def test_the_start_does_not_matter_after_the_settling_time() -> None:
+    """A log that begins one settling time before a frame gives the stabiliser's state of the complete log."""
     profile = extended(phone(), stabilisation_fraction=0.9, stabilisation_cutoff_hz=4.0)
     assert 0.5 < settling_time_s(profile) < 0.7
     whole = moving_lens(sampled(HAND, profile, -1.0, 1.0), profile)
@@ -88,8 +91,8 @@ def test_the_start_is_forgotten_after_the_settling_time() -> None:
     assert settling_time_s(phone()) == 0.0
 
 
-def test_what_a_lens_of_the_same_motion_knows_is_only_taken_where_it_holds() -> None:
-    """A lens worked out like another of the same motion is the lens worked out by itself, whatever else changed."""
+def test_a_cached_lens_is_reused_only_if_valid() -> None:
+    """A lens computed from another one of the same motion equals one computed from scratch."""
     profile = phone()
     trajectory = sampled(HAND, profile, -0.5, 1.2)
     first = moving_lens(trajectory, extended(profile, stabilisation_fraction=0.6, stabilisation_cutoff_hz=0.7))
@@ -105,8 +108,8 @@ def test_what_a_lens_of_the_same_motion_knows_is_only_taken_where_it_holds() -> 
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_a_lens_at_rest_is_the_profiles_own(lens: tuple[str, tuple[float, ...]]) -> None:
-    """Without drift and stabiliser, rays and pixels are those of the intrinsics, to the last bit."""
+def test_a_lens_at_rest_equals_the_intrinsics(lens: tuple[str, tuple[float, ...]]) -> None:
+    """Without drift and stabiliser, rays and pixels are bit-identical to those of the intrinsics."""
     profile = phone(lens=lens)
     moving, still = moving_lens(sampled(HAND, profile, -0.1, 0.1), profile), profile.intrinsics
     assert still is not None
@@ -115,8 +118,8 @@ def test_a_lens_at_rest_is_the_profiles_own(lens: tuple[str, tuple[float, ...]])
     np.testing.assert_array_equal(moving.project(rays, 0.03), still.project(rays))
 
 
-def test_a_growing_focal_length_worked_by_hand() -> None:
-    """At 5 % a second, 2 s after stamp_0 a point 40 px right and 10 above the centre is 44 px right and 11 above."""
+def test_a_focal_drift_matches_a_hand_calculation() -> None:
+    """At 5 % per second, 2 s after stamp_0 a point at (+40, −10) px from the centre is at (+44, −11) px."""
     lens = Intrinsics(200, 136, 220.0, 210.0, 104.0, 63.0)
     moving = MovingLens(lens, 0.05)
     rays = lens.rays(np.array([[144.0, 53.0]]))
@@ -125,8 +128,8 @@ def test_a_growing_focal_length_worked_by_hand() -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_rays_undo_project_at_every_time(lens: tuple[str, tuple[float, ...]]) -> None:
-    """Each pixel with a time of its own goes to its ray and back."""
+def test_projection_inverts_rays_at_every_time(lens: tuple[str, tuple[float, ...]]) -> None:
+    """Each pixel with its own time projects back to itself."""
     profile = extended(phone(lens=lens), focal_drift_per_s=-0.08, stabilisation_fraction=0.7)
     moving = moving_lens(sampled(HAND, profile, -1.0, 1.0), profile)
     time_s = np.linspace(0.1, 0.9, 30)
@@ -139,8 +142,8 @@ def test_rays_undo_project_at_every_time(lens: tuple[str, tuple[float, ...]]) ->
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_rays_are_those_that_the_simulator_renders(lens: tuple[str, tuple[float, ...]]) -> None:
-    """Drift and stabiliser together, in the simulator's order: shift before distortion, drift of all that is seen."""
+def test_rays_match_the_simulator(lens: tuple[str, tuple[float, ...]]) -> None:
+    """Drift and stabiliser apply in the simulator's order: shift before distortion, drift of the complete frame."""
     profile = extended(
         phone(lens=lens, time_offset_s=0.0),
         focal_drift_per_s=0.02,
@@ -159,7 +162,7 @@ def test_rays_are_those_that_the_simulator_renders(lens: tuple[str, tuple[float,
 
 
 def test_a_stabiliser_needs_a_focal_length() -> None:
-    """Without intrinsics there is no lens to move."""
+    """Without intrinsics there is no lens to shift."""
     profile = phone()
     with pytest.raises(ValueError, match="intrinsics"):
         moving_lens(sampled(HAND, profile, 0.0, 0.1), replace(profile, intrinsics=None))

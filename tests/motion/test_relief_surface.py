@@ -1,4 +1,4 @@
-"""Surfaces of inverse depth: a panel before a wall, and scenes that need none."""
+"""Surfaces of inverse depth: a panel in front of a wall, and scenes without relief."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ def aligned(setup: Sway) -> tuple[SwayingCamera, VisualInertialAlignment]:
 
 
 def at(found: VisualInertialAlignment, time_s: float) -> FrameMotion:
-    """The frame that is taken about an instant on the camera's clock."""
+    """The frame around an instant on the camera's clock."""
     motion = found.frame(time_s, time_s, time_s + 0.027)
     assert isinstance(motion, FrameMotion), motion
     return motion
 
 
 def pixels(setup: Sway) -> np.ndarray[Any, Any]:
-    """All over the picture."""
+    """A grid of pixels over the frame."""
     x, y = np.meshgrid(np.arange(15.0, setup.width - 10, 18), np.arange(15.0, setup.height - 10, 18))
     return np.stack([x.ravel(), y.ravel()], axis=-1)
 
 
 @pytest.mark.parametrize("panel", [0.6, 0.4])
-def test_a_panel_before_a_wall_comes_back_within_its_deviations(panel: float) -> None:
-    """Most of the picture lies on one of the two depths, to a tenth of the step; no plane comes near that."""
+def test_a_panel_in_front_of_a_wall_is_recovered(panel: float) -> None:
+    """Most of the frame has one of the two depths within a tenth of the step, far better than with a plane."""
     setup = replace(SCENE, panel=panel)
     camera, found = aligned(setup)
     points_px = pixels(setup)
@@ -61,8 +61,8 @@ def test_a_panel_before_a_wall_comes_back_within_its_deviations(panel: float) ->
         assert (np.abs(left) < 2 * np.hypot(depth.relief.std_at(rays), scale)).mean() > 0.9
 
 
-def test_depth_in_the_middle_is_the_surfaces() -> None:
-    """The logged depth is what stands before the picture's centre, within its deviation."""
+def test_the_logged_depth_is_that_of_the_surface() -> None:
+    """The depth at the centre of the frame is right within three deviations."""
     camera, found = aligned(SCENE)
     middle = np.array([[239.5, 319.5]])
     depth = at(found, 1.45).depth
@@ -78,8 +78,8 @@ def test_depth_in_the_middle_is_the_surfaces() -> None:
         pytest.param(Sway(seed=9, depth_m=1.5, sway_m=0.09, points=12, panel=0.6), id="few tracks"),
     ],
 )
-def test_the_plane_stays_where_a_surface_tells_held_out_points_no_better(setup: Sway) -> None:
-    """A frame is then the one of its plane, digit for digit."""
+def test_the_plane_is_kept_if_a_surface_does_not_predict_better(setup: Sway) -> None:
+    """The frame then equals that of its plane, digit for digit."""
     _, found = aligned(setup)
     for stretch in found.stretches:
         assert stretch.reliefs == (None,) * len(stretch.windows)
@@ -91,7 +91,7 @@ def test_the_plane_stays_where_a_surface_tells_held_out_points_no_better(setup: 
 
 
 def mosaic(count: int = 300, pairs: int = 8, noise: float = 0.01) -> SightedPoints:
-    """Points on patches of 0.1 rad at two inverse depths, 0.3 apart, each seen once in every pair."""
+    """Points on patches of 0.1 rad at two inverse depths 0.3 apart, each seen once per pair."""
     rng = np.random.default_rng(4)
     rays = LENS.rays(rng.uniform((0, 0), (639, 479), (count * pairs, 2)), np.zeros(count * pairs))
     cell = np.floor(angles(rays) / 0.1 + 40).astype(int)
@@ -105,8 +105,8 @@ def mosaic(count: int = 300, pairs: int = 8, noise: float = 0.01) -> SightedPoin
     return SightedPoints(points, pair, np.zeros((len(rays), 3)), rays, found, np.zeros(len(rays)))
 
 
-def test_the_variogram_tells_sill_and_length() -> None:
-    """Patches of equal chance at two depths: half their step for the sill; it is nearly reached at a patch's size."""
+def test_the_variogram_gives_sill_and_length() -> None:
+    """For patches at two equally likely depths, the sill is half the step, nearly reached at the patch size."""
     grid = picture_grid(LENS, 0.0)
     rough = measure_roughness(mosaic(), grid)
     assert rough is not None
@@ -115,7 +115,7 @@ def test_the_variogram_tells_sill_and_length() -> None:
     assert 0.03 < rough.length_rad < 0.1
 
 
-def test_outside_its_grid_a_surface_goes_on_as_at_its_edge() -> None:
+def test_outside_its_grid_a_surface_is_constant() -> None:
     """Between nodes it is bilinear."""
     values = np.array([[0.1, 0.3, -0.2], [0.5, 0.2, 0.4]], np.float32)
     relief = Relief(np.array([-0.2, -0.1]), np.array([0.4, 0.2]), values, values)

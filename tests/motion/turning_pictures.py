@@ -1,7 +1,7 @@
-"""Pictures that a turning phone takes of a wall far away, row by row, and the log of its gyroscope: nothing is encoded.
+"""Frames of a distant wall taken row by row by a turning phone, and its gyroscope log, without encoding.
 
-Orientation comes from synthetic_motion's exact steps, rows and exposures are gone through one by one: nothing of the
-code under test is used but its records.
+The orientation comes from synthetic_motion's exact steps; rows and exposures are computed one by one. Only the records
+of the tested code are used.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 PERIOD_S = 1 / 30
 FINER = 2
-"""Pixels of the wall's drawing in one of the picture."""
+"""Pixels of the wall's drawing per pixel of the frame."""
 
 
 def chessboard(square_px: float, size: int = 3000) -> Picture:
-    """Squares that fill the wall, so wide in the picture."""
+    """Squares of this size in the frame, over the whole wall."""
     y, x = np.mgrid[:size, :size] // (square_px * FINER)
     board = np.where((x + y) % 2 == 0, 40, 205).astype(np.uint8)
     return np.asarray(cv2.GaussianBlur(board, (0, 0), FINER / 2))
@@ -44,7 +44,7 @@ def grating(period_px: float, size: int = 3000) -> Picture:
 
 
 def blobs(size: int = 3000, seed: int = 0) -> Picture:
-    """Texture that repeats nowhere."""
+    """Texture without repetition."""
     rng = np.random.default_rng(seed)
     total = np.zeros((size, size), np.float32)
     for sigma in (3.0, 6.0, 16.0):
@@ -55,7 +55,7 @@ def blobs(size: int = 3000, seed: int = 0) -> Picture:
 
 @dataclass(frozen=True)
 class Phone:
-    """What is recorded, and how."""
+    """The recorded motion and how it is recorded."""
 
     wall: Picture
     motion: Motion
@@ -70,7 +70,7 @@ class Phone:
 
     @property
     def profile(self) -> CameraProfile:
-        """What is true."""
+        """The true profile."""
         centre = (self.width - 1) / 2, (self.height - 1) / 2
         return CameraProfile(
             self.width,
@@ -84,7 +84,7 @@ class Phone:
         )
 
     def record(self) -> Recording:
-        """Take the pictures and the log."""
+        """Take the frames and the log."""
         last_s = self.frames * PERIOD_S + 1.2
         orientation = self.motion.orientation(-1.2, last_s + 0.1)
         rng = np.random.default_rng(5)
@@ -100,7 +100,7 @@ class Phone:
         return Recording(self, capture, pictures, orientation, middle)
 
     def _taken(self, orientation: Slerp, middle: Array, stamp_s: float, rng: np.random.Generator) -> Picture:
-        """One frame: the mean of instants of each row's exposure, with noise."""
+        """One frame: the mean over instants of each row's exposure, with noise."""
         rows_s = stamp_s + np.arange(self.height) / self.height * self.readout_s
         parts = (np.arange(self.instants) + 0.5) / self.instants * self.exposure_s
         light = np.mean([self.view(orientation, middle, rows_s + part) for part in parts], axis=0)
@@ -108,7 +108,7 @@ class Phone:
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
     def view(self, orientation: Slerp, middle: Array, rows_s: Array) -> Array:
-        """The wall as rows see it at single times (height,)."""
+        """The wall as seen by rows at single times (height,)."""
         x, y = np.meshgrid(np.arange(self.width), np.arange(self.height))
         rays = np.stack([x - (self.width - 1) / 2, y - (self.height - 1) / 2, np.full(x.shape, self.focal_px)], -1)
         turned = rays @ np.swapaxes(middle.T @ orientation(rows_s).as_matrix(), -1, -2)
@@ -120,7 +120,7 @@ class Phone:
 
 @dataclass(frozen=True)
 class Recording:
-    """A capture whose pictures are at hand."""
+    """A capture with its frames in memory."""
 
     phone: Phone
     capture: Capture
@@ -129,17 +129,17 @@ class Recording:
     middle: Array
 
     def gray(self, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-        """As captures' readers give them."""
+        """Grey frames, as from a capture's reader."""
         for number in numbers:
             yield number, self.pictures[number]
 
     def sharp(self, number: int) -> Array:
-        """What a frame would show without blur and readout, at the start of its exposure."""
+        """The frame without blur and readout, at the start of its exposure."""
         rows_s = np.full(self.phone.height, number * PERIOD_S)
         return self.phone.view(self.orientation, self.middle, rows_s)
 
     def with_log(self, gyro_rad_s: Array) -> Recording:
-        """The same pictures beside another log."""
+        """The same frames with another log."""
         imu = replace(self.capture.imu, gyro_rad_s=gyro_rad_s)
         return replace(self, capture=replace(self.capture, imu=imu))
 
@@ -150,5 +150,5 @@ class Recording:
 
 
 def shaken(wall: Picture, rate_rad_s: float, seed: int = 3, **changes: object) -> Recording:
-    """A hand's shake, the rms rate as given on each axis."""
+    """A hand's shake with the given RMS rate on each axis."""
     return Phone(wall, hand_motion(seed, rate_rad_s), **changes).record()  # type: ignore[arg-type]

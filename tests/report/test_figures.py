@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: PNG files that show what they were given."""
+"""Figures of a diagnosis: PNG files that show their data."""
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ def decoded(data):
 
 
 def test_a_difference_is_red_where_the_measured_picture_is_brighter():
-    """And blue where it is darker; equal pictures give neither."""
+    """It is blue where the measured picture is darker; equal pictures have neither colour."""
     flat = np.full((60, 90, 3), 120, np.uint8)
     changed = flat.copy()
     changed[:, :30] = 60
@@ -28,7 +28,7 @@ def test_a_difference_is_red_where_the_measured_picture_is_brighter():
 
 
 def test_residuals_are_drawn_before_and_after(rng):
-    """More covariates make a wider figure; values that are no number are passed over."""
+    """More covariates make a wider figure; NaN values are skipped."""
     number = 400
     before = {name: rng.uniform(size=number) for name in ("row", "time", "radius", "rate", "pair")}
     before |= {"x_px": rng.normal(size=number), "y_px": 2.0 * before["row"]}
@@ -42,8 +42,8 @@ def test_residuals_are_drawn_before_and_after(rng):
     assert not (np.abs(two - np.array([70, 130, 180])).sum(axis=-1) < 30).any()
 
 
-def test_few_residuals_and_no_rung_make_a_figure_too():
-    """Where there is nothing to draw, an empty figure is drawn, and no error is met."""
+def test_empty_data_gives_an_empty_figure():
+    """Few or no residuals and an empty ladder raise no error."""
     one = {"row": np.zeros(3), "x_px": np.ones(3), "y_px": np.ones(3)}
     assert decoded(residual_figure(one, {})).size
     assert decoded(residual_figure({}, {})).size
@@ -51,15 +51,15 @@ def test_few_residuals_and_no_rung_make_a_figure_too():
 
 
 @pytest.mark.parametrize(("tried", "mark"), [({"flicker": 0.01}, ", held-out frames"), ({}, "")])
-def test_an_axis_says_what_was_held_out(tried, mark):
-    """Causes of brightness are judged on held-out frames as all others; without a candidate there is only the fit."""
+def test_the_axis_label_names_held_out_frames(tried, mark):
+    """Brightness causes are judged on held-out frames like all others; without a candidate only the fit is shown."""
     axes = canvas(4.0, 3.0).subplots()
     _draw_rung(axes, ("photometric_rms", 0.02, tried, None), 1, "")
     assert axes.get_xlabel().replace("\\_", "_") == f"photometric_rms{mark}"
 
 
-def test_what_entered_stands_out_on_its_rung():
-    """One blue bar where a cause entered, none where nothing did; a candidate without a value is left out."""
+def test_the_cause_that_entered_is_highlighted():
+    """Its bar is blue; without such a cause no bar is. A candidate without a value is left out."""
     tried = {"time_offset": 0.2, "readout_time": 0.9, "gyro_bias": float("nan")}
     blue = [
         (np.abs(decoded(ladder_figure([("geometry_rms_px", 1.0, tried, name)])) - [70, 130, 180]).sum(-1) < 30).sum()

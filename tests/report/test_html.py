@@ -1,4 +1,4 @@
-"""The report page: hostile text stays text, curves and arrows show what they were given, pictures keep their bytes."""
+"""The report page: hostile text stays text, curves and arrows show their data, and pictures respect the byte limit."""
 
 import base64
 import hashlib
@@ -32,7 +32,7 @@ COUNTS = {"restored": 2, "copied": 0, "skipped": 1, "failed": 0}
 
 
 def account(**changes):
-    """What a run.json holds."""
+    """Contents of a run.json."""
     return {
         "capture": "trip",
         "version": "1",
@@ -49,7 +49,7 @@ def account(**changes):
 
 
 def facts(frame, state="restored", **changes):
-    """What is known of one frame, 40 ms after the one before."""
+    """Facts about one frame, 40 ms after the previous one."""
     known = {"blur_px": 3.0 + frame, "longest_blur_px": 5.0 + frame, "deblurred": True, "exposure_s": 0.009}
     return FrameFacts(frame, 5_000_000_000 + 40_000_000 * frame, state, **{**known, **changes})
 
@@ -70,13 +70,13 @@ def page(**changes):
 
 
 def text_of(markup):
-    """The text that a reader sees, white space as one blank."""
+    """The visible text, with white space collapsed."""
     bare = re.sub(r"<(style|script|title)>.*?</\1>", "", markup, flags=re.DOTALL)
     return " ".join(html.unescape(re.sub(r"<[^>]*>", "", bare)).split())
 
 
 def test_hostile_text_is_shown_as_text():
-    """Markup, quotes and control characters make no element and turn no writing; unprintable signs show as codes."""
+    """Markup, quotes and control characters create no element; unprintable characters are shown as codes."""
     hostile = page(
         capture=HOSTILE, command=HOSTILE, warnings=[HOSTILE], settings={HOSTILE: HOSTILE}, profile_source=HOSTILE
     )
@@ -85,8 +85,8 @@ def test_hostile_text_is_shown_as_text():
     assert text_of(hostile).count(" ".join(HOSTILE_SHOWN.split())) >= 5
 
 
-def test_the_policy_names_the_pages_own_style_and_script_and_nothing_else():
-    """The hashes in the policy are those of what stands in the page; no attribute carries style or script."""
+def test_the_policy_allows_only_the_page_s_own_style_and_script():
+    """The policy has the hashes of the page's style and script; no attribute holds style or script."""
     markup = page()
     policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', markup)[1])
     for name in ("style", "script"):
@@ -99,8 +99,8 @@ def test_the_policy_names_the_pages_own_style_and_script_and_nothing_else():
     assert not re.search(r"<[^>]*\s(style|on[a-z]+)=", markup)
 
 
-def test_every_cause_has_words():
-    """A cause that a diagnosis can name is told in plain words, and no others are."""
+def test_every_cause_has_a_description():
+    """Exactly the causes that a diagnosis can name are described in plain words."""
     assert CAUSE_WORDS.keys() == EFFECTS.keys()
 
 
@@ -119,13 +119,13 @@ def test_every_cause_has_words():
         ("focal_drift_per_s", 0.002, 0.0, "0.002 1/s"),
     ],
 )  # fmt: skip
-def test_a_value_is_told_to_two_digits_of_its_deviation(name, value, std, text):
-    """With the unit of its name, seconds as milliseconds."""
+def test_a_value_is_shown_to_two_digits_of_its_deviation(name, value, std, text):
+    """It has the unit of its name; seconds are shown as milliseconds."""
     assert with_deviation(name, value, std) == text
 
 
-def test_an_estimate_travels_with_its_deviation_and_source():
-    """What was estimated says how; what was given says by whom; what is null is not known."""
+def test_an_estimate_is_shown_with_its_deviation_and_source():
+    """An estimate names its method, a given value its file; null is shown as unknown."""
     estimate = {"value": 0.4624, "std": 0.0168, "source": "tracked points"}
     profile = {"imu": {"time_offset_s": 0.4624}, "shutter": {"readout_time_s": None},
                "intrinsics": {"fx_px": 980.5}, "estimates": {"time_offset_s": estimate}}  # fmt: skip
@@ -136,8 +136,11 @@ def test_an_estimate_travels_with_its_deviation_and_source():
     assert camera_values({"imu": 3, "estimates": [1]}, "")[0].text == "unknown"
 
 
-def test_frames_left_alone_are_grouped_by_reason_whatever_its_numbers():
-    """Copied, skipped and failed frames, and restored ones with a remark, each group with its frames as ranges."""
+def test_unrestored_frames_are_grouped_by_reason():
+    """Numbers in a reason do not matter.
+
+    Copied, skipped and failed frames, and those with a remark, are listed as ranges.
+    """
     frames = [facts(k, warnings=(f"blur of 0.{k} px is below 1 px",), deblurred=False) for k in (1, 2, 3, 7)]
     frames += [facts(k, "skipped", warnings=("gap",)) for k in (4, 5)]
     frames += [facts(6, "copied"), facts(8, warnings=("a remark",)), facts(9)]
@@ -151,8 +154,8 @@ def test_frames_left_alone_are_grouped_by_reason_whatever_its_numbers():
     assert ranges([]) == ""
 
 
-def test_the_verdict_counts():
-    """All, some or none restored, and what became of the others."""
+def test_the_verdict_counts_frames():
+    """All, some or no frames are restored, and the others are counted by their status."""
     mixed = run_verdict({**COUNTS, "failed": 4}, "some frames failed", [facts(3)])
     assert (mixed.level, mixed.headline) == ("poor", "1 of 7 frames deblurred, 1 only straightened")
     assert mixed.sentence.startswith("1 skipped, 4 failed.")
@@ -163,8 +166,8 @@ def test_the_verdict_counts():
     assert none.sentence == "3 copied unchanged. Copied: focal length unknown."
 
 
-def test_frames_from_all_over_the_run_are_chosen_the_most_blurred_of_each_part():
-    """Restored ones before others; never more than there are."""
+def test_the_most_blurred_frame_of_each_part_is_shown():
+    """Restored frames come first, and there are never more than exist."""
     blur = [2, 9, 4, 1, 3, 8, 5, 6, 7]
     frames = [facts(k, longest_blur_px=float(b)) for k, b in enumerate(blur)] + [facts(20, "copied")]
     assert [f.frame for f in choose_frames(frames, 3)] == [1, 5, 8]
@@ -173,8 +176,8 @@ def test_frames_from_all_over_the_run_are_chosen_the_most_blurred_of_each_part()
     assert choose_frames([], 3) == []
 
 
-def test_pictures_keep_to_the_bytes_allowed_and_stay_alike_in_size(rng):
-    """Less room makes both smaller; with enough room they keep their size and colours, red first."""
+def test_pictures_respect_the_byte_limit_and_have_equal_size(rng):
+    """A lower limit makes both smaller; a sufficient one keeps size and colours, in the order RGB."""
     noisy = rng.integers(0, 255, (300, 500, 3)).astype(np.uint8)
     before, none, after = embed_pictures([noisy, None, noisy[:, ::-1]], 40_000)
     assert none is None
@@ -192,7 +195,7 @@ def numbers_of(path):
 
 
 def test_arrows_point_where_the_points_moved_and_are_centred_on_their_tile():
-    """x right, y down; lengths in pixels times the scale that the page tells."""
+    """x is right and y is down; lengths are in pixels times the stated scale."""
     field = arrow_field(np.array([[30.0, 20.0], [70.0, 60.0]]), np.array([0.4, -2.2]), np.array([6.0, 3.0]), 100, 80)
     for arrow, centre, angle, length in zip(field.arrows, [(30, 20), (70, 60)], [0.4, -2.2], [6, 3], strict=True):
         tail, tip = numbers_of(arrow.path)[:2]
@@ -204,15 +207,15 @@ def test_arrows_point_where_the_points_moved_and_are_centred_on_their_tile():
 
 
 def test_many_tiles_are_thinned_evenly():
-    """A fine grid keeps whole rows and columns; a single long row keeps some."""
+    """A fine grid keeps complete rows and columns; a single long row keeps some tiles."""
     x, y = np.meshgrid(np.arange(30.0), np.arange(40.0))
     for centres in (np.column_stack([x.ravel(), y.ravel()]), np.column_stack([np.arange(500.0), np.zeros(500)])):
         arrows = arrow_field(centres, np.zeros(len(centres)), np.ones(len(centres)), 500, 400).arrows
         assert MAX_ARROWS / 4 < len(arrows) <= MAX_ARROWS
 
 
-def test_a_curve_breaks_where_nothing_is_known_and_rises_upwards():
-    """Greater values stand higher; a lone value is still drawn; all unknown is no chart."""
+def test_a_curve_breaks_at_unknown_values():
+    """Larger values are higher; a single value is still drawn; without any value there is no chart."""
     time_s = np.arange(6) * 0.04
     chart = time_chart("Blur", "px", time_s, [("a", [1.0, 9.0, None, 4.0, None, 2.0]), ("b", [None] * 6)], [0.08])
     (line,) = chart.lines
@@ -227,7 +230,7 @@ def test_a_curve_breaks_where_nothing_is_known_and_rises_upwards():
 
 
 def test_a_long_curve_keeps_its_peaks():
-    """Least and greatest value of each share survive the thinning."""
+    """Minimum and maximum of each part survive the thinning."""
     values = np.sin(np.arange(20_000) / 37.0)
     values[12_345], values[7:9] = 50.0, np.nan
     time_s, kept = thinned(np.arange(20_000.0), values)
@@ -239,7 +242,7 @@ def test_a_long_curve_keeps_its_peaks():
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 16.6), (-2.3, 1.7), (0.0, 0.0), (0.0, 0.00042), (3.0, 3.0), (0, 9e7)])
 def test_ticks_enclose_the_values_in_round_steps(low, high):
-    """A handful of them, even where all values are the same."""
+    """There are 2 to 8 ticks, even if all values are equal."""
     ticks = nice_ticks(low, high)
     steps = np.diff(ticks)
     assert ticks[0] <= low
@@ -249,15 +252,15 @@ def test_ticks_enclose_the_values_in_round_steps(low, high):
     assert re.fullmatch(r"[125]e[+-]\d+", f"{steps[0]:.0e}")
 
 
-def test_a_band_tells_runs_of_states():
-    """Widths are parts of all frames."""
+def test_a_band_shows_runs_of_states():
+    """Widths are fractions of all frames."""
     stretches = [(s.state, s.start, s.width) for s in band(["a", "a", "b", "a"])]
     assert stretches == [("a", 0.0, 0.5), ("b", 0.5, 0.25), ("a", 0.75, 0.25)]
     assert band([]) == ()
 
 
-def test_a_diagnosis_is_told_with_values_deviations_and_rivals():
-    """Given and found, before and after, what explains as much, and what is left."""
+def test_a_diagnosis_is_shown_with_values_deviations_and_rivals():
+    """The page gives values before and after, held-out residuals, rivals and the remaining residual."""
     change = {"nominal": 0.0, "estimate": 0.0042, "std": 0.00011}
     cause = {"name": "time_offset", "parameters": {"time_offset_s": change},
              "held_out": {"quantity": "geometry_rms_px", "before": 1.41, "after": 0.22, "gain": 0.987},
@@ -273,7 +276,7 @@ def test_a_diagnosis_is_told_with_values_deviations_and_rivals():
 
 
 def test_a_copied_frame_is_not_called_straightened():
-    """What the shutter bent is told, and what was done is told by what was done."""
+    """The description follows the steps done, not the distortion by the shutter."""
     bent = facts(3, "copied", shift_px=5.0, deblurred=False)
     assert bent.done == "copied unchanged"
     straight = facts(4, shift_px=5.0, deblurred=False, straightened=True)
@@ -281,8 +284,8 @@ def test_a_copied_frame_is_not_called_straightened():
     assert facts(5, deblurred=True, straightened=True).done == "deblurred and straightened"
 
 
-def test_only_what_a_profile_states_is_called_given():
-    """A null is unknown, whatever default replaces it; a default may be nobody's."""
+def test_only_values_in_the_profile_are_called_given():
+    """A null is unknown whatever its default; other values may come from the file or be defaults."""
     profile = {"imu": {"time_offset_s": None, "gyro_bias_rad_s": [0.0, 0.0, 0.0]}, "intrinsics": {"fx_px": 500.0}}
     values = {value.title: value.source for value in camera_values(profile, "camera.yaml")}
     assert values["Time offset"] == "unknown"

@@ -1,6 +1,6 @@
 """A recorded frame with known truth, by brute force: many sharp instants of a scene, averaged in linear light.
 
-Row times, rotations and sampling are worked out here and in ``laws``; only the exposure curve is the package's.
+Row times, rotations and sampling are computed here and in ``laws``; only the response curve is the package's.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Recorded:
 
     camera: TurningCamera
     picture: NDArray[np.uint8]
-    """As recorded: blurred, sheared by the readout, encoded, noisy."""
+    """The recorded frame: blurred, distorted by the readout, encoded, noisy."""
     truth: NDArray[np.uint8]
-    """All at the reference time, without blur and noise."""
+    """The frame at the reference time, without blur and noise."""
 
 
 _RECORDED: dict[str, Recorded] = {}
@@ -43,7 +43,7 @@ def camera(
     height: int = 240,
     **changes: object,
 ) -> TurningCamera:
-    """Make a phone with a plain lens, off-centre, turning about all three axes: some 10 px of blur."""
+    """A phone with a plain lens, off-centre, rotating about all three axes with about 10 px of blur."""
     profile = phone(
         width, height, 380.0, readout_time_s=readout_time_s, readout_direction=readout_direction,
         response=ResponseCurve("srgb"),
@@ -52,7 +52,7 @@ def camera(
 
 
 def record(camera: TurningCamera, grey: bool = False, noise_levels: float = 1.0) -> Recorded:
-    """Record a textured scene, in colour or grey; the same frame is made once in a run."""
+    """Record a textured scene, in colour or grey; equal frames are made only once."""
     key = repr((camera, grey, noise_levels))
     if key not in _RECORDED:
         _RECORDED[key] = _record(camera, grey, noise_levels)
@@ -67,7 +67,7 @@ def _record(camera: TurningCamera, grey: bool, noise_levels: float) -> Recorded:
 def record_canvas(
     camera: TurningCamera, canvas: NDArray[np.float32], noise_channels: int = 1, noise_levels: float = 1.0
 ) -> Recorded:
-    """Record light on a canvas (height + 2 MARGIN, width + 2 MARGIN, 3); noise in as many channels."""
+    """Record light on a canvas (height + 2 MARGIN, width + 2 MARGIN, 3), with noise in the given number of channels."""
     profile = camera.profile
     width, height = profile.width, profile.height
     light = np.zeros((height, width, 3))
@@ -80,7 +80,7 @@ def record_canvas(
 
 
 def _sources_px(camera: TurningCamera) -> list[NDArray[np.float32]]:
-    """Where on a canvas each pixel looks at each instant of its row, (h, w, 2); those of two cameras are kept."""
+    """Canvas positions of each pixel at each instant of its row, (h, w, 2); cached for two cameras."""
     key = repr(camera)
     if key not in _SOURCES:
         profile, motion = camera.profile, camera.motion

@@ -1,4 +1,4 @@
-"""Whether the pictures' spectra show paths as long as those predicted."""
+"""Comparison of blur path lengths in the spectra of frames with the predicted ones."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ CURVE = ResponseCurve("srgb")
 
 
 def luma(picture: np.ndarray) -> np.ndarray:
-    """As the reader gives it."""
+    """Luma, as from the reader."""
     return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
 
 
 def shown(exposures: float) -> list[tuple[RowMotion, TilePowers]]:
-    """Frames that turned each in its own way, with what is predicted for so many times their true exposure."""
+    """Frames with different rotations, and predictions for their true exposure times this factor."""
     found = []
     for rate in RATES:
         true = camera(rate, readout_time_s=0.015)
@@ -47,8 +47,8 @@ def shown(exposures: float) -> list[tuple[RowMotion, TilePowers]]:
 
 
 @pytest.mark.parametrize("exposures", [0.6, 1.5, 2.0])
-def test_a_wrong_exposure_is_seen_in_the_length_of_the_paths(exposures: float) -> None:
-    """Paths that are predicted twice as long are half as long by the pictures, and that is beyond doubt."""
+def test_a_wrong_exposure_shows_in_the_blur_path_length(exposures: float) -> None:
+    """Predicted paths that are twice as long are measured as half as long, significantly."""
     found = path_scale(shown(exposures))
     assert found is not None
     assert found.frames == len(RATES)
@@ -56,16 +56,16 @@ def test_a_wrong_exposure_is_seen_in_the_length_of_the_paths(exposures: float) -
     assert abs(np.log(found.scale * exposures)) < 2 * found.std
 
 
-def test_right_paths_are_not_contradicted() -> None:
-    """The scale of a right profile is 1 within two standard deviations, and those are no wider than a quarter."""
+def test_right_blur_paths_are_not_contradicted() -> None:
+    """The scale for a right profile is 1 within two deviations, which are below 0.125."""
     found = path_scale(shown(1.0))
     assert found is not None
     assert abs(np.log(found.scale)) < 2 * found.std < 0.25
     assert not found.contradicts
 
 
-def test_a_movie_of_few_bits_is_doubted() -> None:
-    """Its coder repeats the blur of frames before."""
+def test_a_low_bit_rate_widens_the_deviation() -> None:
+    """Its encoder repeats the blur of earlier frames."""
     frames = shown(1.5)
     much, few = path_scale(frames), path_scale(frames, bits_per_px=0.05)
     assert much is not None
@@ -75,16 +75,16 @@ def test_a_movie_of_few_bits_is_doubted() -> None:
     assert not few.contradicts
 
 
-def test_frames_that_hardly_moved_tell_nothing() -> None:
-    """Nor do a few that did, nor pictures smaller than a tile."""
+def test_frames_with_little_motion_give_no_result() -> None:
+    """Nor do too few frames with motion, or frames smaller than a tile."""
     still = [(camera((0.02, -0.03, 0.01)).motion, powers) for _, powers in shown(1.0)]
     assert path_scale(still) is None
     assert path_scale([*still, *shown(1.0)[: LEAST_FRAMES - 1]]) is None
     assert tile_powers(np.zeros((100, 300), np.uint8), CURVE) is None
 
 
-def test_lamps_are_passed_over() -> None:
-    """Tiles with clipped light are left out while there are others."""
+def test_tiles_with_clipped_highlights_are_left_out() -> None:
+    """Other tiles are used instead."""
     picture = luma(record(camera()).picture)
     whole = tile_powers(picture, CURVE)
     picture[:60, :60] = 255
@@ -95,8 +95,8 @@ def test_lamps_are_passed_over() -> None:
     assert not np.any(np.all(lit.centres_px == whole.centres_px[0], axis=1))
 
 
-def test_lumas_pass_through_and_spectra_of_some_are_kept() -> None:
-    """In order and unchanged."""
+def test_frames_pass_through_while_spectra_are_stored() -> None:
+    """Frames keep their order and are not changed."""
     picture = luma(record(camera()).picture)
     kept: dict[int, TilePowers] = {}
     passed = list(store_powers(((n, picture) for n in range(5)), (1, 3, 9), CURVE, kept))
@@ -105,8 +105,8 @@ def test_lumas_pass_through_and_spectra_of_some_are_kept() -> None:
     assert sorted(kept) == [1, 3]
 
 
-def test_frames_are_looked_at_whose_paths_tell_most() -> None:
-    """Neither those that hardly moved nor those whose paths leave the tiles; evenly, and not too many."""
+def test_frames_with_the_most_informative_paths_are_measured() -> None:
+    """Frames with very short or very long paths are left out; the others are spread evenly up to a limit."""
     paths = BEST_PATH_PX * np.tile([0.01, 0.9, 30.0, 1.2], 30)
     chosen = frames_to_measure(range(120), paths)
     assert len(chosen) <= MOST_FRAMES
@@ -115,6 +115,6 @@ def test_frames_are_looked_at_whose_paths_tell_most() -> None:
     assert max(chosen) > 105
 
 
-def test_an_account_reads_as_a_number_with_its_deviation() -> None:
-    """The deviation is the scale's, not its logarithm's."""
+def test_a_path_scale_is_shown_with_its_deviation() -> None:
+    """The deviation is that of the scale, not of its logarithm."""
     assert str(PathScale(0.5, 0.2, 7)) == "0.50 ± 0.10"

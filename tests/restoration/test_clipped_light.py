@@ -1,4 +1,4 @@
-"""Clipped light spreads along the blur path of its own place."""
+"""Clipped light spreads along the local blur path."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WIDTH, HEIGHT, LENGTH = 160, 120, 12.0
 
 
 def field(centres_px: np.ndarray) -> KernelField:
-    """Across in the left half of the picture, down in the right one; twelve pixels long."""
+    """Horizontal paths in the left half of the frame, vertical ones in the right half; 12 px long."""
     along = np.linspace(0.0, LENGTH, 40)
     across = np.stack([along, 0 * along], -1)
     down = np.stack([0 * along, along], -1)
@@ -26,8 +26,8 @@ def field(centres_px: np.ndarray) -> KernelField:
 BLURRED = SimpleNamespace(field=field, longest_px=LENGTH)
 
 
-def test_a_highlight_reaches_along_the_path_of_where_it_lies() -> None:
-    """Two lamps: the left one's streak lies across, the right one's down; neither is taken for the other's."""
+def test_a_highlight_spreads_along_its_local_path() -> None:
+    """The left highlight's streak is horizontal, the right one's vertical."""
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[55:58, 40] = mask[55:58, 120] = 1
     touched = _along_paths(mask, BLURRED, cv2.dilate)  # type: ignore[arg-type]
@@ -40,7 +40,7 @@ def test_a_highlight_reaches_along_the_path_of_where_it_lies() -> None:
 
 @pytest.mark.parametrize("level", [0.05, 0.2])
 def test_parts_meet_without_a_seam(level: float) -> None:
-    """Where all paths are one, the parts make what the whole picture would; with half of it clipped and with little."""
+    """If all paths are equal, the parts give the result of the whole frame, for much and for little clipped area."""
     rng = np.random.default_rng(4)
     mask = (cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 3) > level).astype(np.uint8)
     same = SimpleNamespace(field=lambda c: field(np.zeros_like(c)), longest_px=LENGTH)
@@ -50,8 +50,8 @@ def test_parts_meet_without_a_seam(level: float) -> None:
         np.testing.assert_array_equal(_along_paths(mask, same, operation), operation(mask, reach))  # type: ignore[arg-type]
 
 
-def test_a_clipped_pixel_alone_is_kept_nowhere() -> None:
-    """The path is longer than it: its neighbours tell what light there was, and nothing needs to be copied."""
+def test_a_single_clipped_pixel_is_not_kept_as_recorded() -> None:
+    """The path is longer than the pixel, so its neighbours determine the light."""
     clipped = np.zeros((HEIGHT, WIDTH), np.float32)
     clipped[55:57, 40] = 1.0
     blurred = SimpleNamespace(field=field, light=[clipped] * 3, dark=[None] * 3, clipped=[clipped, None, None])

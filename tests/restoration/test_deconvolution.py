@@ -1,4 +1,4 @@
-"""Solvers, tried on matrices small enough to be checked by brute force."""
+"""Solvers, tested with matrices small enough for brute force."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Image = NDArray[np.float32]
 
 
 def _matrix(rng: np.random.Generator) -> tuple[Image, Callable[[Image], Image], Callable[[Image], Image]]:
-    """Make a positive 5 x 7 matrix as an operator from pictures (1, 7) to pictures (1, 5)."""
+    """A positive 5 × 7 matrix as an operator from pictures (1, 7) to pictures (1, 5)."""
     a = rng.uniform(0.05, 1, (5, 7)).astype(np.float32) + 2 * np.eye(5, 7, 1, dtype=np.float32)
     return a, lambda x: (a @ x[0])[None], lambda y: (a.T @ y[0])[None]
 
@@ -52,8 +52,8 @@ def test_shrinkage_solves_its_scalar_problem(beta: float, exponent: float) -> No
     assert (cost(found) <= best * (1 + 2e-3) + 2e-3).all()
 
 
-def test_shrinkage_takes_small_values_to_nothing_and_leaves_large_ones() -> None:
-    """Gradients below a threshold vanish, large ones lose little, none grows or changes its sign."""
+def test_shrinkage_zeroes_small_values_and_keeps_large_ones() -> None:
+    """Gradients below a threshold vanish, large ones hardly change, and none grows or changes its sign."""
     v = np.linspace(-20, 20, 801).astype(np.float32)
     shrunk = shrink(v, shrinkage_table(3.0))
     assert (shrunk[np.abs(v) < 0.5] == 0).all()
@@ -67,7 +67,7 @@ def test_shrinkage_takes_small_values_to_nothing_and_leaves_large_ones() -> None
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_differences_and_their_adjoint(axis: int, rng: np.random.Generator) -> None:
-    """Forward differences are linear, their adjoint is their transpose, and a slope is its slope."""
+    """Forward differences are linear, their adjoint is their transpose, and a slope gives its constant."""
     shape = (7, 11)
     assert_linear(lambda x: difference(x, axis), shape, rng)
     assert_adjoint(lambda x: difference(x, axis), lambda y: difference_adjoint(y, axis), shape, shape, rng)
@@ -79,7 +79,7 @@ def test_differences_and_their_adjoint(axis: int, rng: np.random.Generator) -> N
 
 
 def test_roughness_is_the_adjoint_of_weighted_differences(rng: np.random.Generator) -> None:
-    """Dᵀ w D along both axes, on top of what is there; the picture stays."""
+    """Dᵀ w D along both axes is added to the array; the picture is unchanged."""
     picture, weight, there = rng.random((3, 7, 11)).astype(np.float32)
     expected, before = there.copy(), picture.copy()
     for axis in (0, 1):
@@ -98,7 +98,7 @@ def _positive(rng: np.random.Generator, size: int = 8) -> NDArray[np.float64]:
 
 
 def test_conjugate_gradients_solve_a_small_system(rng: np.random.Generator) -> None:
-    """As many steps as unknowns solve a positive system, from any start and with any positive preconditioner."""
+    """A few steps solve a positive system from any start and with any positive preconditioner."""
     matrix, right, start = _positive(rng), rng.normal(size=8), rng.normal(size=8)
     before = start.copy()
     for precondition in (np.ones(8), 1 / np.diag(matrix), rng.uniform(0.2, 1, 8)):
@@ -108,7 +108,7 @@ def test_conjugate_gradients_solve_a_small_system(rng: np.random.Generator) -> N
 
 
 def test_conjugate_gradients_stop_at_the_solution(rng: np.random.Generator) -> None:
-    """Starting at the solution, or with nothing to solve, further steps change nothing and give no NaN."""
+    """Starting at the solution, or with a zero right-hand side, further steps change nothing and give no NaN."""
     matrix, solution = np.diag(np.arange(1.0, 9.0)), np.ones(8)
     found = conjugate_gradients(lambda x: matrix @ x, matrix @ solution, solution, np.ones(8), 20)
     np.testing.assert_allclose(found, solution, atol=1e-6)
@@ -117,7 +117,7 @@ def test_conjugate_gradients_stop_at_the_solution(rng: np.random.Generator) -> N
 
 
 def test_each_step_lowers_the_energy(rng: np.random.Generator) -> None:
-    """½ xᵀ M x − bᵀ x never rises from one step to the next."""
+    """½ xᵀ M x − bᵀ x never increases from one step to the next."""
     matrix, right = _positive(rng), rng.normal(size=8)
     found = [conjugate_gradients(lambda x: matrix @ x, right, np.zeros(8), np.ones(8), n) for n in range(7)]
     energy = [0.5 * x @ matrix @ x - right @ x for x in found]
@@ -128,7 +128,7 @@ def test_each_step_lowers_the_energy(rng: np.random.Generator) -> None:
 
 
 def test_richardson_lucy_raises_the_likelihood(rng: np.random.Generator) -> None:
-    """With a 5 x 7 matrix, each update raises the Poisson likelihood, and many explain the observation."""
+    """Each update raises the Poisson likelihood, and many updates explain the observation."""
     _, apply, adjoint = _matrix(rng)
     observed = apply(rng.uniform(0.2, 2, (1, 7)).astype(np.float32))
     start, weight = np.ones((1, 7), np.float32), np.ones((1, 5), np.float32)
@@ -140,15 +140,15 @@ def test_richardson_lucy_raises_the_likelihood(rng: np.random.Generator) -> None
 
 
 def test_richardson_lucy_keeps_the_light(rng: np.random.Generator) -> None:
-    """After any update the predicted picture has the observed one's sum."""
+    """The predicted picture keeps the sum of the observed one."""
     _, apply, adjoint = _matrix(rng)
     observed = rng.uniform(0.5, 3, (1, 5)).astype(np.float32)
     found = richardson_lucy(observed, apply, adjoint, np.ones((1, 7), np.float32), np.ones_like(observed), 3)
     assert apply(found).sum() == pytest.approx(observed.sum(), rel=1e-3)
 
 
-def test_pixels_without_weight_neither_pull_nor_push(rng: np.random.Generator) -> None:
-    """What a censored pixel shows makes no difference."""
+def test_pixels_without_weight_have_no_influence(rng: np.random.Generator) -> None:
+    """The value of a censored pixel does not matter."""
     _, apply, adjoint = _matrix(rng)
     observed = rng.uniform(0.5, 3, (1, 5)).astype(np.float32)
     other, weight = observed.copy(), np.ones_like(observed)
@@ -168,7 +168,7 @@ def _objective(f: Image, observed: Image, apply: Callable[[Image], Image], data_
 
 
 def test_hyper_laplacian_finds_a_step(rng: np.random.Generator) -> None:
-    """A step seen through a 5 x 7 matrix comes back better than by least squares, and at a lower objective."""
+    """A step seen through a 5 × 7 matrix is recovered better than by least squares, with a lower objective."""
     a, apply, adjoint = _matrix(rng)
     step = np.array([[1, 1, 1, 4, 4, 4, 4]], np.float32)
     observed = apply(step)
@@ -184,15 +184,15 @@ def test_hyper_laplacian_finds_a_step(rng: np.random.Generator) -> None:
 
 
 def test_hyper_laplacian_trusts_clean_data(rng: np.random.Generator) -> None:
-    """With the identity for an operator and much trust in the data, the picture is the observation."""
+    """With the identity operator and a large data weight, the result is the observation."""
     observed = rng.uniform(0, 1, (6, 9)).astype(np.float32)
     ones = np.ones_like(observed)
     found = hyper_laplacian(observed, np.copy, np.copy, np.zeros_like(observed), ones, ones, 1e6, 1.0, (1.0, 10.0), 30)
     np.testing.assert_allclose(found, observed, atol=2e-3)
 
 
-def test_hyper_laplacian_fills_what_has_no_weight(rng: np.random.Generator) -> None:
-    """A pixel without weight is filled in from its neighbours, whatever it shows."""
+def test_hyper_laplacian_fills_pixels_without_weight(rng: np.random.Generator) -> None:
+    """A pixel without weight is filled from its neighbours, whatever its value."""
     observed = np.full((6, 9), 0.5, np.float32)
     weight, ones = np.ones_like(observed), np.ones_like(observed)
     observed[2, 4], weight[2, 4] = 30, 0
@@ -202,8 +202,8 @@ def test_hyper_laplacian_fills_what_has_no_weight(rng: np.random.Generator) -> N
     np.testing.assert_allclose(found, 0.5, atol=5e-3)
 
 
-def test_solvers_leave_their_input_alone(rng: np.random.Generator) -> None:
-    """Neither start nor observation is written into."""
+def test_solvers_do_not_change_their_input(rng: np.random.Generator) -> None:
+    """Neither the start nor the observation is overwritten."""
     _, apply, adjoint = _matrix(rng)
     observed, start = np.ones((1, 5), np.float32), rng.uniform(1, 2, (1, 7)).astype(np.float32)
     before = (observed.copy(), start.copy())
@@ -214,8 +214,8 @@ def test_solvers_leave_their_input_alone(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(start, before[1])
 
 
-def test_over_relaxed_steps_of_richardson_lucy_get_further(rng: np.random.Generator) -> None:
-    """As many steps, each 1.7 times as far, come nearer to the data, and the light stays positive."""
+def test_over_relaxed_richardson_lucy_converges_faster(rng: np.random.Generator) -> None:
+    """Steps 1.7 times as long come closer to the data in the same number, and light stays positive."""
     matrix, apply, adjoint = _matrix(rng)
     sharp = rng.uniform(0.1, 2.0, (1, matrix.shape[1])).astype(np.float32)
     observed, weight = apply(sharp), np.ones((1, matrix.shape[0]), np.float32)
@@ -225,8 +225,11 @@ def test_over_relaxed_steps_of_richardson_lucy_get_further(rng: np.random.Genera
     assert far.min() > 0
 
 
-def test_texture_too_faint_for_the_prior_comes_back_on_each_tiles_own_spectrum(rng: np.random.Generator) -> None:
-    """Where the solution explains all that was recorded nothing is added, else a part of what it leaves."""
+def test_faint_texture_is_restored_from_the_residual(rng: np.random.Generator) -> None:
+    """If the solution explains the record nothing is added.
+
+    Otherwise a part of the residual is, with each tile's own spectrum.
+    """
     size = 32
     powers, solved = rng.random((2, 2, size, size)).astype(np.float32)
     deconvolution = SimpleNamespace(powers=powers, at_border=[False, True], size=size)

@@ -1,4 +1,4 @@
-"""Back to grey levels: through the curve, and with the colour of what is around."""
+"""Conversion of light to grey levels."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ CURVES = {
 
 
 @pytest.mark.parametrize("curve", [pytest.param(c, id=n) for n, c in CURVES.items()])
-def test_encoding_undoes_the_table_at_every_level(curve: ResponseCurve) -> None:
-    """All 256 levels, through the table to light and back, are themselves, held between black and the curve's top."""
+def test_encoding_inverts_the_table_at_every_level(curve: ResponseCurve) -> None:
+    """All 256 levels are reproduced through light, limited to the curve's black and top."""
     levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
     picture = np.stack([levels, levels.T, levels[::-1]], -1)
     low, high = np.rint(255 * curve.encode(np.array(curve.light_range)))
@@ -33,15 +33,15 @@ def test_encoding_undoes_the_table_at_every_level(curve: ResponseCurve) -> None:
     np.testing.assert_array_equal(encode_picture(light, curve), np.clip(picture, low, high))
 
 
-def test_encoding_holds_light_that_no_curve_reaches() -> None:
-    """Light below nothing and beyond the brightest becomes black and the top, never a wrapped-around level."""
+def test_encoding_clips_light_outside_the_curve() -> None:
+    """Light below zero or above the maximum becomes black or white, never a wrapped-around level."""
     light = [np.array([[-5.0, -1e-3, 1.001, 40.0]], np.float32)] * 3
     np.testing.assert_array_equal(encode_picture(light, ResponseCurve("srgb"))[..., 0], [[0, 0, 255, 255]])
 
 
 @pytest.mark.parametrize("curve", [pytest.param(c, id=n) for n, c in CURVES.items()])
 def test_grey_levels_are_those_of_the_curve(curve: ResponseCurve) -> None:
-    """Light all over the curve's range and beyond comes to its grey within a hundredth of a level."""
+    """Light within the curve's range and beyond is encoded within 0.01 levels."""
     low, high = curve.light_range
     light = np.linspace(low, high + 0.2 * (high - low), 70 * 50).reshape(70, 50).astype(np.float32)
     np.testing.assert_allclose(grey_levels(light, curve), 255 * curve.encode(np.clip(light, low, high)), atol=0.01)

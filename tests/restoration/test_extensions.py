@@ -1,4 +1,4 @@
-"""What a diagnosis adds to a profile makes restored pictures truer: simulated captures, nominal and true profile."""
+"""Extensions of a profile improve restored frames: simulated captures with nominal and true profiles."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SETTINGS = PRESETS["fast"]
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
-    """A small capture with effects hidden in it, made once for its options."""
+    """A small capture with hidden effects, made once per set of options."""
     made: dict[str, Capture] = {}
 
     def make(**options: Any) -> Capture:
@@ -55,14 +55,14 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Simulated:
 
 
 def profiles(capture: Capture) -> tuple[CameraProfile, CameraProfile]:
-    """Nominal and true."""
+    """Nominal and true profile."""
     return resolve_profile(capture)[0], resolve_profile(capture, capture.folder / "truth" / "camera.yaml")[0]
 
 
 def restored(
     capture: Capture, plan: RestorationPlan, chosen: slice, frames: tuple[Frame, ...] | None = None
 ) -> list[RestoredFrame]:
-    """The capture's chosen frames, restored."""
+    """The capture's selected frames, restored."""
     frames = frames or capture.frames
     last = frames[chosen][-1].index
     pictures = dict(read_frames(capture.movie, probe_movie(capture.movie), 0, last))
@@ -70,7 +70,7 @@ def restored(
 
 
 def psnr_db(capture: Capture, found: RestoredFrame) -> float:
-    """Against the truth, within the valid rectangle."""
+    """PSNR against the truth, within the valid rectangle."""
     truth = cv2.imread(str(capture.folder / "truth" / "frames" / f"{found.frame.index:06d}.png"))
     assert truth is not None
     assert found.picture is not None
@@ -81,7 +81,7 @@ def psnr_db(capture: Capture, found: RestoredFrame) -> float:
 
 
 def gains_db(capture: Capture, chosen: slice) -> NDArray[np.float64]:
-    """PSNR with the true profile less that with the nominal one, frame by frame."""
+    """PSNR with the true profile minus that with the nominal one, per frame."""
     nominal, true = (
         np.array([psnr_db(capture, f) for f in restored(capture, RestorationPlan(p, SETTINGS), chosen)])
         for p in profiles(capture)
@@ -99,17 +99,17 @@ def gains_db(capture: Capture, chosen: slice) -> NDArray[np.float64]:
         ("vignetting=0.75", {"rate_rad_s": 3.0, "readout_ms": 28.0}, 0.3),
     ],
 )
-def test_a_profile_that_knows_the_effect_restores_better(
+def test_a_profile_with_the_effect_restores_better(
     simulated: Simulated, effect: str, options: dict[str, Any], least_db: float
 ) -> None:
-    """The mean gain is that of the effect, and no frame loses."""
+    """The mean gain is that of the effect, and no frame loses more than 0.2 dB."""
     gain = gains_db(simulated(effects=[effect], **options), slice(1, 10, 3))
     assert gain.mean() > least_db
     assert gain.min() > -0.2
 
 
-def test_corners_that_are_soft_are_restored_as_soft_as_they_are(tmp_path: Path) -> None:
-    """Each tile has the blur of its place: better than none for all, and than the mean for all."""
+def test_soft_corners_are_restored_with_their_local_blur(tmp_path: Path) -> None:
+    """The local blur of each tile is better than no blur and than the mean blur everywhere."""
     sigma_px, corner_px = 2.4, float(np.hypot(320, 240) / 2)
     nominal = nominal_camera(320, 240, focal_px=260.0, readout_time_s=0.02, response=ResponseCurve("srgb"))
     settings = SessionSettings("leaves", 10, 30.0, exposure_s=(0.01,), rate_rad_s=1.2, noise_levels=1.0, seed=3)
@@ -129,16 +129,16 @@ def test_corners_that_are_soft_are_restored_as_soft_as_they_are(tmp_path: Path) 
     assert min(right - without) > 0
 
 
-def test_a_gain_is_common_to_the_frame_and_stays(simulated: Simulated) -> None:
-    """The truth has the frame's gain, and so has the restored picture, whether the profile knows it or not."""
+def test_a_gain_of_the_frame_is_kept(simulated: Simulated) -> None:
+    """The truth has the frame's gain, and so has the restored frame, with and without the gain in the profile."""
     capture = simulated(effects=["gain_drift=0.15"])
     found = restored(capture, RestorationPlan(profiles(capture)[1], SETTINGS), slice(1, 10, 4))
     assert min(psnr_db(capture, f) for f in found) > 30
     np.testing.assert_array_equal(gains_db(capture, slice(1, 10, 4)), 0)
 
 
-def test_frames_of_the_start_up_are_restored_at_their_true_times(simulated: Simulated) -> None:
-    """Pictures three frames late come out as those that their own stamps would have shown wrongly."""
+def test_start_up_frames_are_restored_at_their_true_times(simulated: Simulated) -> None:
+    """Frames three periods late are restored better than with their own timestamps."""
     capture = simulated(effects=["stabilisation=0.7,0.8", "frame_lag=0.1,7"], frames=20)
     _, true = profiles(capture)
     plan = RestorationPlan(true, SETTINGS)
@@ -151,14 +151,14 @@ def test_frames_of_the_start_up_are_restored_at_their_true_times(simulated: Simu
 
 
 def true_poses(capture: Capture) -> tuple[CubicSpline, Slerp]:
-    """Position in world axes, and rotation from camera to world, at any time."""
+    """Position in world axes and rotation from camera to world, at any time."""
     table = np.loadtxt(capture.folder / "truth" / "trajectory.csv", delimiter=",", skiprows=1)
     turn = Slerp(table[:, 0], Rotation.from_quat(table[:, 4:8], scalar_first=True))
     return CubicSpline(table[:, 0], table[:, 1:4]), turn
 
 
 def true_translations(capture: Capture, profile: CameraProfile) -> dict[int, FrameTranslation]:
-    """Velocity, acceleration and the scene's plane of each frame, from the truth's trajectory in world axes."""
+    """Velocity, acceleration and scene plane of each frame, from the true trajectory in world axes."""
     position, turn = true_poses(capture)
     plane = json.loads((capture.folder / "truth" / "effects.json").read_text(encoding="utf-8"))["scene_plane"]
     normal, foot = np.array(plane["normal"]), np.array([0, 0, plane["depth_m"]])
@@ -172,8 +172,8 @@ def true_translations(capture: Capture, profile: CameraProfile) -> dict[int, Fra
     return found
 
 
-def test_true_velocity_and_plane_undo_the_sway(simulated: Simulated) -> None:
-    """A hand that sways by 0.08 m before a leaning wall 1.5 m away: far better than by the rotation alone."""
+def test_true_velocity_and_plane_correct_the_sway(simulated: Simulated) -> None:
+    """A hand sways by 0.08 m in front of a tilted wall at 1.5 m: restoration is far better than with rotation alone."""
     capture = simulated(depth_m=1.5, sway_m=0.08, tilt_deg=(12, -18), rate_rad_s=0.6, exposure_ms=14.0, seed=7)
     _, true = profiles(capture)
     plan = RestorationPlan(true, SETTINGS)
@@ -189,7 +189,9 @@ def test_true_velocity_and_plane_undo_the_sway(simulated: Simulated) -> None:
     start_s = moved[0].frame.time_s + 119.5 / 240 * 0.020
     to_camera = turn(start_s).as_matrix().T
     travelled = to_camera @ (position(start_s + 0.014) - position(start_s))
-    np.testing.assert_allclose(said["motion"]["delta_position_m"], travelled, atol=1e-4)  # the hand also jerks
+    np.testing.assert_allclose(
+        said["motion"]["delta_position_m"], travelled, atol=1e-4
+    )  # the hand's motion also has jerk
     np.testing.assert_allclose(said["motion"]["velocity_m_s"], to_camera @ position(start_s, 1), atol=0.01)
     back = turn(start_s + 0.014).as_matrix().T @ to_camera.T
     end = back @ ([0, 0, said["depth_m"]] - travelled)
@@ -199,8 +201,8 @@ def test_true_velocity_and_plane_undo_the_sway(simulated: Simulated) -> None:
     assert turned[0].parameters["blur"]["length_px"] != pytest.approx(length, abs=0.2)
 
 
-def test_a_stabilised_picture_does_not_depend_on_where_the_log_is_cut(simulated: Simulated) -> None:
-    """A worker that has a part of the inertial data restores what one that has them all restores."""
+def test_a_stabilised_frame_does_not_depend_on_the_cut_of_the_log(simulated: Simulated) -> None:
+    """A worker with a part of the inertial data gives the same result as one with all of it."""
     capture = simulated(effects=["stabilisation=0.7,0.8"], frames=150, width=160, height=128, rate_rad_s=2.0)
     _, true = profiles(capture)
     plan = RestorationPlan(true, SETTINGS)
@@ -216,10 +218,10 @@ def test_a_stabilised_picture_does_not_depend_on_where_the_log_is_cut(simulated:
         assert np.abs(a.picture.astype(int) - b.picture).max() <= 1
 
 
-def test_process_applies_a_profiles_extensions_whatever_the_jobs(
+def test_process_applies_extensions_for_any_number_of_jobs(
     simulated: Simulated, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Stabiliser and recorder lag together: no frame is left out, the log says what is applied, bytes are the same."""
+    """With stabiliser and recorder lag, no frame is skipped, the log names both, and the bytes are the same."""
     capture = simulated(effects=["stabilisation=0.7,0.8", "frame_lag=0.1,7"], frames=20)
     config = capture.folder / "truth" / "camera.yaml"
     written = []

@@ -1,4 +1,4 @@
-"""Pictures whose power lies at few places of the spectrum: walls of brick, blinds, gratings, boards from afar."""
+"""Pictures with few spatial frequencies: brick walls, blinds, gratings, distant boards."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from virest.restoration.taken_part import blurred_part
 WIDTH, HEIGHT = 520, 400
 Scene = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 ALONG_RAD = np.arctan2(0.9, 2.0)
-"""About the direction in which the picture moves under RATE_RAD_S."""
+"""Approximate direction of motion in the frame for RATE_RAD_S."""
 RATE_RAD_S = (0.9, -2.0, 0.6)
 
 
@@ -53,12 +53,12 @@ def _statistics(turning: TurningCamera, picture: NDArray[np.uint8]) -> PictureSt
     return measure_picture(picture, kernel_field(turning.motion, centres_px, 0.5), ResponseCurve("srgb"))[0]
 
 
-# ── what the picture says of itself ──────────────────────────────────────────────────────────────────────────────
+# ── statistics of the picture ────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("angle_rad", [ALONG_RAD, ALONG_RAD + np.pi / 2, 1.2])
-def test_a_grating_is_told_from_texture(angle_rad: float) -> None:
-    """Rings hold for texture, and no place is looked at; a grating does not fit them, in whatever direction it lies."""
+def test_a_grating_is_distinguished_from_texture(angle_rad: float) -> None:
+    """Statistics by rings fit texture without single frequencies; a grating in any direction does not fit them."""
     turning = camera(RATE_RAD_S, width=WIDTH, height=HEIGHT)
     natural = np.repeat(texture(HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN, 5)[..., None], 3, -1).astype(np.float32)
     assert _statistics(turning, record_canvas(turning, natural, noise_levels=2.0).picture).places is None
@@ -69,10 +69,8 @@ def test_a_grating_is_told_from_texture(angle_rad: float) -> None:
 
 @pytest.mark.parametrize("speed", [1.0, 0.3])
 @pytest.mark.parametrize("scene", [_bars, _board])
-def test_gratings_are_told_whatever_their_size_and_direction(
-    scene: Callable[[float, float], Scene], speed: float
-) -> None:
-    """Neither S and N that fit rings best nor those that are settled on describe them: both misfits are large."""
+def test_gratings_of_any_size_and_direction_are_detected(scene: Callable[[float, float], Scene], speed: float) -> None:
+    """Neither the best-fitting ring statistics nor the final ones describe them: both misfits are large."""
     turning = camera(tuple(speed * r for r in RATE_RAD_S), width=WIDTH, height=HEIGHT)  # type: ignore[arg-type]
     for period_px in (7.0, 21.0):
         for angle_rad in (ALONG_RAD, 1.2):
@@ -81,18 +79,18 @@ def test_gratings_are_told_whatever_their_size_and_direction(
             assert found.unevenness == 1.0
 
 
-def test_upright_bars_are_told_by_their_few_places_along_the_axes() -> None:
-    """Places near the axes are no part of the fit, so upright bars do not harm it; there they are seen."""
+def test_upright_bars_are_detected_by_frequencies_on_the_axes() -> None:
+    """Frequencies near the axes are not part of the fit, so upright bars do not affect it."""
     turning = camera(tuple(0.5 * r for r in RATE_RAD_S), 0.02, width=WIDTH, height=HEIGHT)  # type: ignore[arg-type]
     found = _statistics(turning, record_canvas(turning, _canvas(_bars(21.0, 0.02)), noise_levels=3.0).picture)
     assert found.misfit < 0.6
     assert found.unevenness > 0.3
 
 
-def test_bars_along_the_motion_promise_little() -> None:
-    """Bars that the motion does not blur show their power where nothing is lost, and so there is little to gain.
+def test_bars_along_the_motion_have_a_small_expected_gain() -> None:
+    """Bars that the motion does not blur lose no power, so there is little to gain.
 
-    By rings alone it would be taken to stand in all directions, most of them cancelled.
+    Ring statistics alone would assume equal power in all directions, most of it removed by the blur.
     """
     turning = camera(RATE_RAD_S, width=WIDTH, height=HEIGHT)
     bars = record_canvas(turning, _canvas(_sine(13.0, ALONG_RAD + np.pi / 2)), noise_levels=2.0).picture
@@ -100,8 +98,8 @@ def test_bars_along_the_motion_promise_little() -> None:
     assert found.expected_gain_db < 0.5 * replace(found, places=None).expected_gain_db
 
 
-def test_a_share_of_each_place_lands_on_its_own_frequency() -> None:
-    """Ten times less power at one place, (−20, 30) / 128, is ten times more N / S there, and half way to the next."""
+def test_statistics_of_a_frequency_apply_to_that_frequency() -> None:
+    """Ten times less power at (−20, 30) / 128 gives ten times the N / S up to halfway to the next frequency."""
     frequency, share = (np.arange(24) + 0.5) / 48, np.ones((128, 63), np.float32)
     share[108, 29] = 0.1
     places = PlaceStatistics(1.0, share, share)
@@ -115,7 +113,7 @@ def test_a_share_of_each_place_lands_on_its_own_frequency() -> None:
     np.testing.assert_allclose(changed, 1.0, rtol=1e-5)
 
 
-# ── never worse ──────────────────────────────────────────────────────────────────────────────────────────────────
+# ── no loss ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 SCENES = {
     "sine along": _sine(17.0, ALONG_RAD),
@@ -130,7 +128,7 @@ SCENES = {
 @pytest.mark.parametrize("scene", [pytest.param(s, id=n) for n, s in SCENES.items()])
 @pytest.mark.parametrize("rate", [1.0, 0.5])
 def test_no_grating_gets_worse(scene: Scene, rate: float) -> None:
-    """Restored gratings are at most 0.1 dB worse than the straightened recorded ones, whichever way they lie."""
+    """Restored gratings are at most 0.1 dB worse than straightened ones, in any direction."""
     turning = camera(tuple(rate * r for r in RATE_RAD_S), 0.02, width=WIDTH, height=HEIGHT)
     recorded = record_canvas(turning, _canvas(scene), noise_levels=3.0)
 
@@ -146,11 +144,11 @@ def test_no_grating_gets_worse(scene: Scene, rate: float) -> None:
     assert min(gains_db.values()) > -0.1, gains_db
 
 
-# ── tiles around the centre of a turn ────────────────────────────────────────────────────────────────────────────
+# ── tiles around the centre of rotation ──────────────────────────────────────────────────────────────────────────
 
 
-def test_where_paths_change_within_a_tile_its_kernel_is_not_used() -> None:
-    """Under a turn about the optical axis large tiles leave more of the middle alone; kernels without tiles do not."""
+def test_a_kernel_is_not_used_where_paths_change_within_its_tile() -> None:
+    """For a roll, larger tiles leave more of the centre unchanged; kernels without tiles do not."""
     motion = camera((0.0, 0.0, 6.0), width=WIDTH, height=HEIGHT).motion
     left_alone = []
     for tile_px in (0, 60, 120, 180):
@@ -162,6 +160,6 @@ def test_where_paths_change_within_a_tile_its_kernel_is_not_used() -> None:
 
 
 def test_a_pan_is_restored_everywhere() -> None:
-    """Where the paths are about the same in all of the picture, tiles of any size hold."""
+    """If the blur paths are nearly the same over the frame, tiles of any size are valid."""
     motion = camera(RATE_RAD_S, 0.02, width=WIDTH, height=HEIGHT).motion
     assert blurred_part(motion, 1.0, 144) == 1.0

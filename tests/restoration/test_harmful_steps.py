@@ -1,4 +1,4 @@
-"""Steps that the pictures' own account of the motion speaks against are not taken."""
+"""Steps contradicted by the observed motion are not applied."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RATE = (0.9, -2.0, 0.1)
 
 
 def turning(times: float = 1.0, turned_rad: float = 0.0) -> RowMotion:
-    """A motion so many times as fast, in a direction turned in the picture."""
+    """A motion with this factor of speed, in a direction rotated in the frame."""
     x, y, z = RATE
     cos, sin = np.cos(turned_rad), np.sin(turned_rad)
     rate = (times * (cos * x - sin * y), times * (sin * x + cos * y), times * z)
@@ -28,19 +28,19 @@ def turning(times: float = 1.0, turned_rad: float = 0.0) -> RowMotion:
     ("times", "turned_rad", "loses"),
     [(1.0, 0.0, False), (1.2, 0.0, False), (1.5, 0.0, True), (0.4, 0.0, False), (1.0, 0.15, False), (1.0, 1.6, True)],
 )
-def test_what_reaches_beyond_the_seen_path_is_a_loss(times: float, turned_rad: float, loses: bool) -> None:
-    """A path predicted too short does no harm; one far too long, or across, does."""
+def test_deblurring_harms_if_the_path_exceeds_the_observed_one(times: float, turned_rad: float, loses: bool) -> None:
+    """A predicted path that is too short does no harm; one that is far too long or perpendicular does."""
     assert deblurring_harms(turning(times, turned_rad), turning()) is loses
 
 
 @pytest.mark.parametrize(("times", "loses"), [(1.0, False), (0.3, False), (1.6, False), (2.2, True), (-0.5, True)])
-def test_straightening_is_a_loss_where_points_would_end_further_off(times: float, loses: bool) -> None:
-    """As far too far, or the wrong way."""
+def test_straightening_harms_if_points_would_move_away(times: float, loses: bool) -> None:
+    """Turns of 2.2 times the true one, or in the wrong direction, move points away from their true places."""
     assert straightening_harms(turning(times), turning(), 0.5) is loses
 
 
-def test_a_frame_against_which_everything_speaks_is_copied_and_says_why() -> None:
-    """Against none of it, it is restored; both reasons stand in its warnings."""
+def test_a_frame_with_contradicting_motion_is_copied_with_reasons() -> None:
+    """Both reasons appear in its warnings; a frame without contradictions is restored."""
     made = camera(RATE, readout_time_s=0.02)
     picture = record(made).picture
     settings = PRESETS["fast"]
@@ -56,8 +56,8 @@ def test_a_frame_against_which_everything_speaks_is_copied_and_says_why() -> Non
     assert copied.parameters["shutter"]["method"] == "none"
 
 
-def test_rows_may_be_right_where_the_blur_is_not() -> None:
-    """A wrong exposure leaves the rows' own times: straightened, not deblurred."""
+def test_a_wrong_blur_still_allows_straightening() -> None:
+    """A wrong exposure does not affect row times: the frame is straightened but not deblurred."""
     made = camera(RATE, readout_time_s=0.02)
     assert made.exposure_s is not None
     seen = replace(made, exposure_s=0.4 * made.exposure_s, stamp_s=made.stamp_s + 0.3 * made.exposure_s).motion

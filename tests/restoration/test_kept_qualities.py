@@ -1,4 +1,4 @@
-"""Qualities of restored pictures and limits of plans that nothing else would miss."""
+"""Qualities of restored frames and limits of plans that no other test covers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from virest.restoration.shutter import warp
 
 
 def test_straightening_keeps_fine_detail() -> None:
-    """Half a pixel to the side, a wave of five pixels keeps most of its contrast; a straight line loses a fifth."""
+    """At a shift of half a pixel, a wave of 5 px keeps 90 % of its contrast; linear interpolation would lose 20 %."""
     x = np.arange(120, dtype=np.float32)
     wave = np.tile(128 + 80 * np.sin(2 * np.pi * x / 5), (16, 1)).astype(np.uint8)
     source = np.stack(np.meshgrid(x + 0.5, np.arange(16, dtype=np.float32)), axis=-1).astype(np.float32)
@@ -28,8 +28,8 @@ def test_straightening_keeps_fine_detail() -> None:
     assert np.std(middle) > 0.9 * np.std(wave[:, 10:-10].astype(float))
 
 
-def test_a_straightened_picture_keeps_the_vignetting_of_where_its_pixels_go() -> None:
-    """Light recorded in a corner and moved inwards gets the inner place's vignetting; flicker is taken away."""
+def test_straightened_pixels_get_the_vignetting_of_their_destination() -> None:
+    """Light moved from a corner inwards gets the inner vignetting; flicker is removed."""
     curve = ResponseCurve("srgb")
     height, width = 12, 20
     recorded = np.full((height, width), 0.5, np.float32)
@@ -42,10 +42,10 @@ def test_a_straightened_picture_keeps_the_vignetting_of_where_its_pixels_go() ->
 
 
 @pytest.mark.parametrize(("std_s", "copied"), [(0.001, False), (0.004, True), (2.0, True)])
-def test_frames_are_copied_where_the_offset_is_not_known_well_enough(
+def test_frames_are_copied_if_the_offset_is_too_uncertain(
     std_s: float, copied: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At a radian a second and 500 px, 4 ms are 2 px: as much as the blur that is to be undone."""
+    """At 1 rad/s and 500 px, an error of 4 ms is 2 px, as much as the blur to be removed."""
     estimate = OffsetEstimate(0.02, std_s, True, explained=0.99)
     monkeypatch.setattr(capture_estimation, "estimate_time_offset", lambda *_: estimate)
     lens = Intrinsics(640, 480, 500.0, 500.0, 319.5, 239.5)

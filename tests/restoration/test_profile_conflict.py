@@ -1,4 +1,4 @@
-"""A profile that tracked points contradict: the cause is found and taken, and nothing is taken from a right one."""
+"""Profiles contradicted by tracked points: the cause is found and corrected, and a right profile is not changed."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ HAND = Setup(seed=71, frames=26, points=40, gyro_noise_rad_s=0.002)
 
 
 def settled(recording: Recording, profile: CameraProfile, *, offset_known: bool = True) -> Settled:
-    """What the recording's points make of a profile."""
+    """The recording's points applied to a profile."""
     return settle_conflict(recording.observed, recording.imu, profile, offset_known=offset_known)
 
 
 def focal_px(profile: CameraProfile) -> float:
-    """Of a profile that has one."""
+    """The profile's focal length."""
     assert profile.intrinsics is not None
     return profile.intrinsics.fx_px
 
 
 @pytest.mark.parametrize("factor", [0.55, 1.75])
-def test_a_focal_length_stated_wrong_is_put_right(factor: float) -> None:
-    """Far off or near by; the principal point stays, and where the value comes from is noted."""
+def test_a_wrong_focal_length_is_corrected(factor: float) -> None:
+    """The principal point stays, and the estimate is recorded with its deviation."""
     recording = recorded(HAND)
     lens = recording.profile.intrinsics
     assert lens is not None
@@ -40,7 +40,7 @@ def test_a_focal_length_stated_wrong_is_put_right(factor: float) -> None:
 
 
 def test_a_gyroscope_s_scale_is_not_taken_for_a_focal_length() -> None:
-    """Turns about the optical axis move points by no focal length: the gyroscope is found, and the lens stays."""
+    """In a roll, points do not move with the focal length: the gyroscope scale is found, and the lens stays."""
     recording = recorded(replace(HAND, gyro_scale=1.05))
     found = settled(recording, replace(recording.profile, gyro_scale=(1.0, 1.0, 1.0)))
     assert found.contradicted
@@ -51,8 +51,8 @@ def test_a_gyroscope_s_scale_is_not_taken_for_a_focal_length() -> None:
     assert "cannot tell them apart" not in found.taken[0]
 
 
-def test_where_a_motion_cannot_tell_gyroscope_and_lens_apart_both_are_named() -> None:
-    """Through a narrow lens yaw and pitch tell nothing but the product of focal length and scale."""
+def test_indistinguishable_gyroscope_scale_and_focal_length_are_both_named() -> None:
+    """With a narrow lens, yaw and pitch determine only the product of focal length and scale."""
     narrow = replace(HAND, seed=72, focal_px=2500.0, rate_rad_s=0.15, about=(0.0, 1.0, 1.0), gyro_scale=1.05)
     recording = recorded(narrow)
     found = settled(recording, replace(recording.profile, gyro_scale=(1.0, 1.0, 1.0)))
@@ -63,8 +63,8 @@ def test_where_a_motion_cannot_tell_gyroscope_and_lens_apart_both_are_named() ->
 
 
 @pytest.mark.parametrize("fraction", [0.2])
-def test_a_stabiliser_that_no_profile_names_is_found(fraction: float) -> None:
-    """By its fraction and cutoff, and nothing else is taken for it."""
+def test_an_unlisted_stabiliser_is_found(fraction: float) -> None:
+    """Fraction and cutoff are right, and no other cause is reported."""
     recording = recorded(replace(HAND, stabilised=(fraction, 0.8)))
     found = settled(recording, replace(recording.profile, extensions=Extensions()))
     assert found.profile.extensions.stabilisation_fraction == pytest.approx(fraction, abs=0.02)
@@ -74,8 +74,8 @@ def test_a_stabiliser_that_no_profile_names_is_found(fraction: float) -> None:
 
 
 @pytest.mark.parametrize("seed", [71, 73, 75])
-def test_a_stabiliser_that_never_lets_go_is_found(seed: int) -> None:
-    """Half a second tells no cutoff below 1 Hz from none; the fraction is found all the same."""
+def test_a_stabiliser_with_a_very_low_cutoff_is_found(seed: int) -> None:
+    """Half a second cannot resolve a cutoff below 1 Hz; the fraction is still found."""
     recording = recorded(replace(HAND, seed=seed, frames=16, stabilised=(0.2, 0.002)))
     found = settled(recording, replace(recording.profile, extensions=Extensions()))
     assert found.profile.extensions.stabilisation_fraction == pytest.approx(0.2, abs=0.03)
@@ -83,8 +83,8 @@ def test_a_stabiliser_that_never_lets_go_is_found(seed: int) -> None:
     assert focal_px(found.profile) == pytest.approx(520.0, rel=1e-9)
 
 
-def test_clocks_that_drift_are_found_where_the_offset_is_stated_and_where_it_is_not() -> None:
-    """Skews of 0.01 over two seconds; an unknown offset is fitted along."""
+def test_drifting_clocks_are_found_with_and_without_a_known_offset() -> None:
+    """The skew is 0.01 over less than 2 s; an unknown offset is fitted too."""
     recording = recorded(replace(HAND, clock_skew=0.01, frames=50, points=25))
     given = replace(recording.profile, clock_skew=0.0)
     assert settled(recording, given).profile.clock_skew == pytest.approx(0.01, abs=3e-4)
@@ -95,8 +95,8 @@ def test_clocks_that_drift_are_found_where_the_offset_is_stated_and_where_it_is_
     assert found.offset[0] == pytest.approx(0.013, abs=5e-4)
 
 
-def test_a_stabiliser_and_a_wrong_focal_length_are_told_apart() -> None:
-    """Two causes enter one after the other."""
+def test_a_stabiliser_and_a_wrong_focal_length_are_separated() -> None:
+    """The two causes enter one after the other."""
     recording = recorded(replace(HAND, stabilised=(0.5, 1.0)))
     lens = recording.profile.intrinsics
     assert lens is not None
@@ -116,8 +116,8 @@ def test_a_stabiliser_and_a_wrong_focal_length_are_told_apart() -> None:
     ],
     ids=["right", "moving object", "gyroscope's bias", "hardly moving"],
 )
-def test_a_right_profile_is_left_as_it_is(setup: Setup) -> None:
-    """Nothing is taken: not from a thing that moves by itself, nor from a bias, nor from a camera nearly at rest."""
+def test_a_right_profile_is_not_changed(setup: Setup) -> None:
+    """Moving objects, a bias and a camera nearly at rest give no correction."""
     recording = recorded(setup)
     given = replace(recording.profile, gyro_bias_rad_s=HAND.gyro_bias_rad_s)
     found = settled(recording, given)
@@ -125,8 +125,8 @@ def test_a_right_profile_is_left_as_it_is(setup: Setup) -> None:
     assert found.profile is given
 
 
-def test_what_no_cause_explains_is_said_and_not_taken() -> None:
-    """Points that follow another gyroscope: the profile stays, and is called contradicted."""
+def test_an_unexplained_conflict_changes_nothing() -> None:
+    """With another recording's gyroscope, the profile stays and is reported as contradicted."""
     recording, stranger = recorded(HAND), recorded(replace(HAND, seed=72))
     found = settle_conflict(recording.observed, stranger.imu, recording.profile, offset_known=True)
     assert found.contradicted

@@ -1,4 +1,4 @@
-"""A picture whose luma is restored smaller: to the measure of the smaller picture in everything."""
+"""A picture with luma restored at a smaller scale: all quantities use the scale of the smaller picture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CURVE = ResponseCurve("srgb")
 
 
 def _field(centres_px: NDArray[np.float64]) -> KernelField:
-    """Straight paths along x, longer by a hundredth of a pixel for every pixel to the right."""
+    """Straight paths along x, longer by 0.01 px for every pixel to the right."""
     length = 10 + 0.01 * centres_px[:, 0, None]
     along = length * np.linspace(-0.5, 0.5, 31)
     return KernelField(centres_px, np.stack([along, 0 * along], -1), 0.5)
@@ -31,8 +31,8 @@ def _blurred(picture: NDArray[np.uint8]) -> blurred.BlurredPicture:
     return blurred.blurred_picture(picture, CURVE, (statistics, statistics), _field, 12.0)
 
 
-def test_kernels_and_light_go_to_the_smaller_picture() -> None:
-    """A pixel of the small picture has the kernel of the place that it shows, shortened; one grey stays that grey."""
+def test_kernels_and_light_follow_the_smaller_picture() -> None:
+    """A pixel of the small picture has the shortened kernel of its position; a uniform grey stays the same."""
     small = blurred.reduced(_blurred(np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8)), 1.5)
     assert small.light[0].shape == (80, 112)
     assert np.ptp(small.light[0]) < 1e-6
@@ -44,7 +44,7 @@ def test_kernels_and_light_go_to_the_smaller_picture() -> None:
 
 
 def test_clipped_light_stays_clipped_in_the_smaller_picture() -> None:
-    """A lamp is a hole of the small picture that covers all of it, and nothing far from it."""
+    """A clipped highlight covers exactly the pixels of the small picture that it touches."""
     picture = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
     picture[40:47, 90:101] = 255
     hole = blurred.reduced(_blurred(picture), 1.5).clipped[0]
@@ -54,8 +54,8 @@ def test_clipped_light_stays_clipped_in_the_smaller_picture() -> None:
     assert (columns.min(), columns.max()) == (60, 67)
 
 
-def test_blocks_at_the_edge_are_means_of_what_is_there(rng: np.random.Generator) -> None:
-    """Whole squares, and the narrower rest at the right and below, each have the mean of their own pixels."""
+def test_blocks_at_the_edge_are_means_of_their_pixels(rng: np.random.Generator) -> None:
+    """Complete squares and the narrower ones at the right and bottom have the mean of their own pixels."""
     plane = rng.random((11, 16)).astype(np.float32)
     means = blurred.block_means(plane, 3)
     assert means.shape == (4, 6)
@@ -64,8 +64,8 @@ def test_blocks_at_the_edge_are_means_of_what_is_there(rng: np.random.Generator)
     np.testing.assert_allclose(blurred.block_means(plane[:8], 4), plane[:8].reshape(2, 4, 4, 4).mean((1, 3)), rtol=1e-5)
 
 
-def test_tiles_are_as_large_as_their_kernels_hold() -> None:
-    """Paths or a defocus that grow twice as fast, or half the noise, halve the side; even ones never do."""
+def test_tiles_are_as_large_as_their_kernels_allow() -> None:
+    """Paths or a defocus that grow twice as fast, or half the noise, halve the side; uniform ones set no limit."""
 
     def sides(growth: float, noise_levels: float) -> NDArray[np.float64]:
         def field(centres_px: NDArray[np.float64]) -> KernelField:
@@ -81,8 +81,8 @@ def test_tiles_are_as_large_as_their_kernels_hold() -> None:
     assert sides(0.0, 1.0).min() > 1e4
 
 
-def test_a_path_longer_than_its_tiles_still_fits_them() -> None:
-    """Thin margins grow where a kernel would not fit the transform."""
+def test_a_path_longer_than_a_tile_enlarges_the_transform() -> None:
+    """Thin margins grow if a kernel would not fit."""
     blurred = _blurred(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
 
     def field(centres_px: NDArray[np.float64]) -> KernelField:
@@ -98,8 +98,8 @@ def test_a_path_longer_than_its_tiles_still_fits_them() -> None:
     assert np.isfinite(flat).all()
 
 
-def test_the_measured_part_is_looked_for_around_holes_only() -> None:
-    """It is 0 in the holes, rises within the codec's reach, and is 1 beyond; at the picture's corner too."""
+def test_the_measured_part_is_reduced_only_around_holes() -> None:
+    """It is 0 in the holes, rises within the codec's reach, and is 1 beyond, also at the corner of the frame."""
     holes = np.zeros((HEIGHT, WIDTH), np.float32)
     holes[2:9, 3:14] = 1
     part = clipped_light.measured_part(holes)
@@ -110,7 +110,7 @@ def test_the_measured_part_is_looked_for_around_holes_only() -> None:
 
 
 def test_any_channel_may_be_clipped() -> None:
-    """1 where the brightest channel is clipped, whichever it is, and None where none is."""
+    """The result is 1 where any channel is clipped, and None if none is."""
     picture = np.full((30, 44, 3), 100, np.uint8)
     assert blurred.clipped_anywhere(picture, CURVE) is None
     picture[3, 5, 0] = picture[7, 11, 1] = picture[13, 17, 2] = 255

@@ -1,4 +1,4 @@
-"""One frame, whole: sharper and in its place, in colour and grey; odd pictures neither crash nor get worse."""
+"""A complete frame: sharper and unshifted, in colour and grey; unusual pictures neither crash nor get worse."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _picture(result: RestoredFrame) -> NDArray[np.uint8]:
 
 
 def _shift_px(picture: NDArray[np.uint8], truth: NDArray[np.uint8], border: int = 40) -> float:
-    """How far a picture lies from where it should, by phase correlation of its inside."""
+    """Shift of a picture relative to the truth, by phase correlation of its inside."""
     one, two = (
         cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32)[border:-border, border:-border] for p in (picture, truth)
     )
@@ -55,13 +55,13 @@ def _shift_px(picture: NDArray[np.uint8], truth: NDArray[np.uint8], border: int 
     return float(np.hypot(*cv2.phaseCorrelate(one, two, window)[0]))
 
 
-# ── sharper, and in its place ────────────────────────────────────────────────────────────────────────────────────
+# ── sharper and unshifted ────────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("reference", ["exposure-start", "frame-middle"])
 @pytest.mark.parametrize("shutter", ["none", "rowwise"])
 def test_a_deblurred_picture_is_sharper_and_not_shifted(reference: str, shutter: str) -> None:
-    """Anchored at the start or the middle, warped or not, the picture shows the reference time, within 0.12 px."""
+    """Anchored at the start or the middle, warped or not, the frame shows the reference time within 0.12 px."""
     turning = camera(reference=reference)
     recorded = record(turning)
     result = _restore(turning, recorded.picture, replace(BALANCED, reference=reference, shutter=shutter))
@@ -69,7 +69,7 @@ def test_a_deblurred_picture_is_sharper_and_not_shifted(reference: str, shutter:
     assert result.status == "restored"
     assert _shift_px(picture, recorded.truth) < 0.12
     if reference == "exposure-start":
-        assert _shift_px(recorded.picture, recorded.truth) > 3, "the recorded picture lies half a blur away"
+        assert _shift_px(recorded.picture, recorded.truth) > 3, "the recorded frame is shifted by half the blur"
     own = record(replace(turning, reference="frame-middle"))
     gain = psnr_db(picture, recorded.truth, 30) - psnr_db(own.picture, own.truth, 30)
     assert gain > 1.8
@@ -83,12 +83,12 @@ def test_a_deblurred_picture_is_sharper_and_not_shifted(reference: str, shutter:
         ("bottom_to_top", "perspective", 0.0, 0.25),
     ],
 )
-def test_a_sheared_picture_is_straightened_and_sharp(
+def test_a_rolling_shutter_frame_is_straightened_and_sharp(
     direction: str, shutter: str, roll_rad_s: float, within_px: float
 ) -> None:
-    """With a rolling shutter too, the result is the global picture of the reference time.
+    """With a rolling shutter, the result is the global-shutter frame of the reference time.
 
-    The paper's four corners cannot follow a roll: its homography is then off by 1.4 px in the picture's middle.
+    The paper's four corners cannot follow a roll: its homography is off by 1.4 px in the middle of the frame.
     """
     turning = camera((0.5, -1.1, roll_rad_s), 0.02, direction, exposure_s=0.016)
     recorded = record(turning)
@@ -104,7 +104,7 @@ def test_a_sheared_picture_is_straightened_and_sharp(
 
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "inverse"])
 def test_every_method_gains(method: str) -> None:
-    """Whatever method is asked for, the picture gains over straightening alone."""
+    """Every deblurring method gains over straightening alone."""
     turning = camera()
     recorded = record(turning)
     iterations = 15 if method == "richardson-lucy" else 4
@@ -117,7 +117,7 @@ def test_every_method_gains(method: str) -> None:
 
 @pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
 def test_a_grey_picture_stays_grey(settings: RestorationSettings) -> None:
-    """Where red, green and blue are equal they stay so, within 2 levels, and sharpen alike."""
+    """Equal red, green and blue stay equal within 2 levels and are sharpened equally."""
     turning = camera()
     recorded = record(turning, grey=True)
     assert np.ptp(recorded.picture.astype(int), axis=-1).max() == 0
@@ -126,8 +126,8 @@ def test_a_grey_picture_stays_grey(settings: RestorationSettings) -> None:
     assert psnr_db(picture, recorded.truth, 30) > psnr_db(recorded.picture, recorded.truth, 30) + 2
 
 
-def test_the_picture_handed_in_is_left_alone() -> None:
-    """Nothing is written into the caller's array."""
+def test_the_input_picture_is_not_changed() -> None:
+    """The caller's array is not overwritten."""
     turning = camera()
     picture = record(turning).picture.copy()
     before = picture.copy()
@@ -135,11 +135,11 @@ def test_the_picture_handed_in_is_left_alone() -> None:
     np.testing.assert_array_equal(picture, before)
 
 
-# ── what is left alone ───────────────────────────────────────────────────────────────────────────────────────────
+# ── unchanged frames ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def test_a_still_camera_is_copied() -> None:
-    """Without motion the decoded pixels are returned unchanged, as `copied`, with the reason."""
+    """Without motion the decoded pixels are returned unchanged with status "copied" and a reason."""
     turning = camera((0.0, 0.0, 0.0), 0.02)
     picture = record(turning).picture
     result = _restore(turning, picture)
@@ -151,7 +151,7 @@ def test_a_still_camera_is_copied() -> None:
 
 
 def test_without_an_exposure_time_a_frame_is_only_straightened() -> None:
-    """An unknown exposure forbids deblurring, not straightening, and the log says so."""
+    """An unknown exposure prevents deblurring but not straightening, and the log says so."""
     turning = camera((0.5, -1.1, 0.4), 0.02)
     recorded = record(turning)
     blind = replace(turning, exposure_s=None)
@@ -161,8 +161,8 @@ def test_without_an_exposure_time_a_frame_is_only_straightened() -> None:
     assert any("exposure" in w for w in result.warnings)
 
 
-def test_asking_for_nothing_copies() -> None:
-    """With neither deblurring nor straightening wanted the pixels come back unchanged."""
+def test_without_deblurring_and_straightening_a_frame_is_copied() -> None:
+    """The pixels are returned unchanged."""
     turning = camera()
     picture = record(turning).picture
     result = _restore(turning, picture, replace(BALANCED, deblur="none", shutter="none"))
@@ -170,8 +170,8 @@ def test_asking_for_nothing_copies() -> None:
     np.testing.assert_array_equal(_picture(result), picture)
 
 
-def test_a_lens_that_shows_nothing_is_copied() -> None:
-    """Where straightening would leave no recorded pixel, the recorded picture comes back, and the log says why."""
+def test_a_frame_without_any_straightened_pixel_is_copied() -> None:
+    """If straightening would leave no recorded pixel, the recorded frame is returned with a warning."""
     turning = camera((0.5, 1.0, 0.2), readout_time_s=0.02)
     intrinsics = replace(turning.profile.intrinsics, cx_px=-1e5)
     turning = replace(turning, profile=replace(turning.profile, intrinsics=intrinsics))
@@ -183,8 +183,8 @@ def test_a_lens_that_shows_nothing_is_copied() -> None:
     assert result.parameters["shutter"]["method"] == result.parameters["deblur"]["method"] == "none"
 
 
-def test_a_copied_frame_says_why() -> None:
-    """A frame without motion has all of the log's keys, null where unknown."""
+def test_a_copied_frame_has_a_reason() -> None:
+    """Its log has all keys."""
     picture = np.full((48, 64, 3), 7, np.uint8)
     result = copied_frame(FRAME, picture, phone(64, 48), "no focal length")
     assert (result.status, result.warnings, result.valid_px) == ("copied", ("no focal length",), (0, 0, 64, 48))
@@ -193,13 +193,13 @@ def test_a_copied_frame_says_why() -> None:
     assert set(result.parameters) == {"motion", "depth_m", "depth_source", "blur", "shutter", "response", "deblur"}
 
 
-# ── odd pictures ─────────────────────────────────────────────────────────────────────────────────────────────────
+# ── unusual pictures ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (200, 40, 90), (128, 128, 128)])
-def test_one_colour_stays_that_colour(method: str, colour: tuple[int, int, int]) -> None:
-    """A black, white or single-coloured frame comes back as it was, without seams, by every method."""
+def test_a_uniform_picture_stays_unchanged(method: str, colour: tuple[int, int, int]) -> None:
+    """Every method returns a black, white or single-coloured frame without seams."""
     turning = camera(readout_time_s=0.01, width=200, height=136)
     picture = np.full((136, 200, 3), colour, np.uint8)
     result = _picture(_restore(turning, picture, replace(BALANCED, deblur=method, iterations=3)))
@@ -211,7 +211,7 @@ def test_one_colour_stays_that_colour(method: str, colour: tuple[int, int, int])
 def test_tiny_pictures_are_restored_without_a_crash(
     method: str, width: int, height: int, rng: np.random.Generator
 ) -> None:
-    """Pictures smaller than a tile, of odd sizes too, give pictures of the same size and no warning of NumPy's."""
+    """Frames smaller than a tile, also with odd sizes, keep their size and cause no NumPy warning."""
     turning = camera(readout_time_s=0.01, width=width, height=height)
     picture = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
     with np.errstate(invalid="raise", divide="raise"):
@@ -220,8 +220,8 @@ def test_tiny_pictures_are_restored_without_a_crash(
 
 
 @pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
-def test_lights_in_the_dark_do_not_ring(settings: RestorationSettings) -> None:
-    """A clipped streak on black leaves the dark as dark as it was, farther than a blur length away."""
+def test_highlights_in_the_dark_do_not_ring(settings: RestorationSettings) -> None:
+    """Around a clipped streak on black, the dark stays dark beyond a blur length."""
     turning = camera()
     picture = np.full((240, 336, 3), 4, np.uint8)
     cv2.line(picture, (150, 100), (164, 112), (255, 255, 255), 5)
@@ -232,10 +232,10 @@ def test_lights_in_the_dark_do_not_ring(settings: RestorationSettings) -> None:
 
 
 @pytest.mark.parametrize(("preset", "left"), [("fast", 0.7), ("balanced", 0.45), ("best", 0.45)])
-def test_the_dark_beside_a_bright_colour_gets_its_own_colour_back(preset: str, left: float) -> None:
-    """A surface of one hue, light and shade in squares: the colour that blur carried into the shade is taken out again.
+def test_dark_areas_beside_a_bright_colour_keep_their_own_colour(preset: str, left: float) -> None:
+    """On a surface of one hue with light and dark squares, colour that the blur carried into the dark is removed.
 
-    The luma's edges are the colour's.
+    The edges of luma and colour coincide.
     """
     turning = camera(reference="frame-middle")
     height, width = turning.profile.height + 2 * MARGIN, turning.profile.width + 2 * MARGIN
@@ -256,7 +256,7 @@ def test_the_dark_beside_a_bright_colour_gets_its_own_colour_back(preset: str, l
 
 @pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
 def test_a_vivid_surface_keeps_its_colour(settings: RestorationSettings) -> None:
-    """Green tiles too bright for one channel stay as green as they were, edges included."""
+    """Green tiles with one clipped channel keep their colour, including the edges."""
     turning = camera()
     picture = record(turning).picture.copy()
     tiles = np.zeros(picture.shape[:2], np.uint8)
@@ -267,12 +267,12 @@ def test_a_vivid_surface_keeps_its_colour(settings: RestorationSettings) -> None
     assert (result != picture).any()
     inside = cv2.erode(tiles, np.ones((9, 9), np.uint8)) > 0
     colour = (result[..., 1] - result[..., 2])[inside]
-    assert colour.mean() > 150, "of 165"
+    assert colour.mean() > 150, "the recorded difference is 165"
 
 
 @pytest.mark.parametrize("settings", [pytest.param(s, id=n) for n, s in PRESETS.items()])
-def test_thin_lines_on_clipped_paper_stay(settings: RestorationSettings) -> None:
-    """Between white that was too bright there is nothing measured to restore lines from: they stay as recorded."""
+def test_thin_lines_on_clipped_paper_are_kept(settings: RestorationSettings) -> None:
+    """Between clipped white areas there is no measured light to restore lines from: they stay as recorded."""
     turning = camera()
     picture = record(turning).picture.copy()
     picture[60:200, 80:280] = 255
@@ -286,7 +286,7 @@ def test_thin_lines_on_clipped_paper_stay(settings: RestorationSettings) -> None
 
 
 def test_noise_is_measured_where_the_blur_is() -> None:
-    """Under a turn about the optical axis the tiles around it, which cancel nothing, are left out, others are not."""
+    """For a roll, tiles around the centre, where the blur removes nothing, are left out."""
     turning = camera((0.0, 0.0, 2.0))
     x, y = np.meshgrid(np.linspace(20, 315, 8), np.linspace(20, 220, 6))
     centres = np.stack([x, y], -1).reshape(-1, 2)
@@ -296,8 +296,8 @@ def test_noise_is_measured_where_the_blur_is() -> None:
     assert far.min() > 0.4 * far.max()
 
 
-def test_few_iterations_assume_the_coders_noise() -> None:
-    """`fast` assumes at least half of the noise that steps of 60 grey levels leave, `balanced` what it measured."""
+def test_few_iterations_assume_coding_noise() -> None:
+    """``fast`` assumes at least half of the noise of steps of 60 grey levels, ``balanced`` the measured noise."""
     turning = camera()
     recorded = record(turning)
     noise = {}
@@ -313,10 +313,10 @@ def test_few_iterations_assume_the_coders_noise() -> None:
     assert noise["balanced", 60.0] == noise["balanced", None]
 
 
-def test_few_iterations_keep_texture_that_noise_would_drown() -> None:
-    """A coder's step far too large for faint texture costs `fast` less than a dB: noise that is assumed wipes out none.
+def test_few_iterations_keep_faint_texture() -> None:
+    """A coding step far too large for faint texture costs ``fast`` less than 1 dB.
 
-    The prior of sparse gradients alone takes that texture for noise, and loses twice as much.
+    The prior of sparse gradients alone treats that texture as noise and loses twice as much.
     """
     turning = camera((0.4, -1.0, 0.3))
     light = texture(turning.profile.height + 2 * MARGIN, turning.profile.width + 2 * MARGIN)
@@ -342,8 +342,11 @@ def _numbers(value: Any) -> list[float]:
     return [value] if isinstance(value, int | float) else []
 
 
-def test_the_log_holds_the_contracts_figures() -> None:
-    """Motion, blur and shutter of a known turn: quaternion of ω e, blur against it, corners where eq 28 sends them."""
+def test_the_log_has_the_documented_figures() -> None:
+    """Motion, blur and shutter of a known rotation.
+
+    Quaternion of ω e, blur in the opposite direction, corners by eq 28.
+    """
     turning = camera((0.0, -2.0, 0.0), 0.02)
     result = _restore(turning, record(turning).picture)
     log = result.parameters
@@ -351,7 +354,7 @@ def test_the_log_holds_the_contracts_figures() -> None:
     np.testing.assert_allclose(log["motion"]["delta_q_wxyz"], [np.cos(half), 0, -np.sin(half), 0], atol=1e-7)
     np.testing.assert_allclose(log["motion"]["rate_rad_s"], [0, -2, 0], atol=1e-6)
     assert log["motion"]["velocity_m_s"] is None
-    assert abs(log["blur"]["angle_rad"]) < 0.01, "yaw to the left moves points to the right"
+    assert abs(log["blur"]["angle_rad"]) < 0.01, "a yaw to the left moves points to the right"
     assert log["blur"]["length_px"] == pytest.approx(380 * 0.024, rel=0.01)
     corners = np.array([[0, 0], [335, 0], [335, 239], [0, 239]], float)
     motion = turning.motion
@@ -365,8 +368,8 @@ def test_the_log_holds_the_contracts_figures() -> None:
     assert {"estimate", "deblur", "shutter"} <= set(result.seconds)
 
 
-def test_travel_over_depth_is_undone_and_called_no_metres() -> None:
-    """Blur and straightening are those of the same travel in metres; displacement, velocity and depth are null."""
+def test_translation_over_depth_is_corrected_without_metres() -> None:
+    """Blur and straightening equal those of the translation in metres; displacement, velocity and depth are null."""
     turning = camera((0.0, -2.0, 0.0), 0.02)
     travel = FrameTranslation(np.array([0.4, 0.1, 0.2]), np.zeros(3), np.array([0.05, 0.0, 0.6]), 1.6, "triangulated")
     logs = []
@@ -387,8 +390,8 @@ def test_travel_over_depth_is_undone_and_called_no_metres() -> None:
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("level", [0, 255])
-def test_what_is_censored_all_around_stays_as_it_was(preset: str, level: int) -> None:
-    """Inside an area beyond A or D, a blur length from its edge, the recorded grey level comes back."""
+def test_censored_areas_keep_their_grey_level(preset: str, level: int) -> None:
+    """Inside an area beyond A or D, a blur length from its edge, the recorded level is kept."""
     turning = camera(reference="frame-middle")
     turning = replace(turning, profile=replace(turning.profile, response=FIVE_SEGMENT))
     picture = np.clip(record(turning).picture, 40, 220)
@@ -398,8 +401,11 @@ def test_what_is_censored_all_around_stays_as_it_was(preset: str, level: int) ->
     np.testing.assert_array_equal(restored[85:155, 115:225], level)
 
 
-def test_a_mask_that_is_undone_is_no_part_of_the_result() -> None:
-    """Deblurred without the mask it is what comes of a picture that had none; left alone it stays as recorded."""
+def test_a_reversed_mask_does_not_affect_the_result() -> None:
+    """Deblurred without the mask, the frame is close to that of a picture without one.
+
+    A copied frame stays as recorded.
+    """
     turning = camera(reference="frame-middle")
     recorded = record(turning)
     mask = UnsharpMask(0.8, 1.2)
@@ -417,8 +423,8 @@ def test_a_mask_that_is_undone_is_no_part_of_the_result() -> None:
     np.testing.assert_array_equal(_picture(copied), shown)
 
 
-def test_where_nothing_was_blurred_the_mask_stays_as_well() -> None:
-    """About a camera that rolls the middle is as it was shown, the corners are deblurred without the mask."""
+def test_the_mask_stays_where_nothing_was_blurred() -> None:
+    """For a roll, the centre stays as recorded and the corners are deblurred without the mask."""
     turning = camera((0.0, 0.0, 2.5), reference="frame-middle")
     shown = record(turning).picture
     unmasked = without_mask(shown, UnsharpMask(0.8, 1.2))
@@ -432,8 +438,8 @@ def test_where_nothing_was_blurred_the_mask_stays_as_well() -> None:
     assert np.abs(restored - shown)[:40, :40].mean() > 2
 
 
-def test_colours_that_were_hardly_blurred_keep_their_detail() -> None:
-    """With few iterations too: red and blue waves of 12 px, of one luma, under a path of 2 px."""
+def test_hardly_blurred_colours_keep_their_detail() -> None:
+    """Even with few iterations: red and blue waves of 12 px with equal luma, for a path of 2 px."""
     turning = camera(rate_rad_s=(0.18, -0.4, 0.12), reference="frame-middle")
     profile = turning.profile
     height, width = profile.height + 2 * MARGIN, profile.width + 2 * MARGIN
@@ -450,11 +456,11 @@ def test_colours_that_were_hardly_blurred_keep_their_detail() -> None:
         for p in (picture, recorded.picture)
     ]
     after, before = (error[40:-40, 40:-40, 1:].mean() for error in off)
-    assert after < 3 * before, "a quarter of the size leaves seven times the error"
+    assert after < 3 * before, "chroma at a quarter of the size gives seven times the error"
 
 
-def test_the_log_of_a_frame_without_motion_holds_the_readout_where_it_is_known() -> None:
-    """And null where it is not."""
+def test_the_log_of_a_frame_without_motion_has_the_known_readout() -> None:
+    """An unknown readout time is null."""
     profile = phone(64, 64, 80.0, readout_time_s=0.02)
     assert unknown_parameters(profile).as_json()["shutter"]["readout_time_s"] == 0.02
     unknown = replace(profile, readout_known=False)
@@ -462,8 +468,8 @@ def test_the_log_of_a_frame_without_motion_holds_the_readout_where_it_is_known()
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
-def test_a_colourful_thing_on_grey_ground_keeps_its_colour(preset: str) -> None:
-    """The frame's only colour lies where the roll blurs least; noise is measured where it blurs most."""
+def test_a_colourful_object_on_grey_keeps_its_colour(preset: str) -> None:
+    """The only colour lies where the roll blurs least; noise is measured where it blurs most."""
     turning = camera(
         rate_rad_s=(2.0 * 100 / 380, 2.0 * 150 / 380, 2.0), width=480, height=336, reference="frame-middle"
     )
@@ -483,8 +489,8 @@ def test_a_colourful_thing_on_grey_ground_keeps_its_colour(preset: str) -> None:
 
 
 @pytest.mark.parametrize("preset", ["fast", "balanced"])
-def test_a_saturated_surface_gets_no_stripes_of_what_lies_beside_it(preset: str) -> None:
-    """Green without red before a bright ground: ringing of the ground's red would show at the curve's dark end."""
+def test_a_saturated_surface_gets_no_stripes(preset: str) -> None:
+    """Green without red beside a bright area: ringing of red would show at the dark end of the curve."""
     turning = camera(reference="frame-middle")
     profile = turning.profile
     y, x = np.mgrid[-MARGIN : profile.height + MARGIN, -MARGIN : profile.width + MARGIN]
@@ -495,11 +501,11 @@ def test_a_saturated_surface_gets_no_stripes_of_what_lies_beside_it(preset: str)
     result = _picture(_restore(turning, recorded.picture, replace(PRESETS[preset], reference="frame-middle")))
     inside = from_disc[MARGIN:-MARGIN, MARGIN:-MARGIN] < 50
     shown, wanted = (picture[..., 0][inside].astype(float) for picture in (result, recorded.truth))
-    assert np.sqrt(np.mean((shown - wanted) ** 2)) < 2.5, "1.1 as recorded, 3 by the linear filter alone"
+    assert np.sqrt(np.mean((shown - wanted) ** 2)) < 2.5, "1.1 for the recorded frame, 3 with the linear filter alone"
 
 
 def _seen_along(path_px: NDArray[np.float64], curve: ResponseCurve) -> Any:
-    """What the light's corrections need of an 80 × 120 picture that was blurred along one path everywhere."""
+    """Input of the light corrections for a picture of 80 × 120 blurred along one path everywhere."""
 
     def field(centres_px: NDArray[np.float64]) -> KernelField:
         return KernelField(centres_px, np.repeat(path_px[None], len(centres_px), 0), 0.5)
@@ -517,8 +523,8 @@ def _seen_along(path_px: NDArray[np.float64], curve: ResponseCurve) -> Any:
     )
 
 
-def test_light_that_agrees_is_left_alone_below_nothing_too() -> None:
-    """A curve's zero of light is a convention: plain surfaces stay, whichever side of it they lie on."""
+def test_consistent_light_is_unchanged_even_below_zero() -> None:
+    """The curve's zero of light is a convention: uniform surfaces stay on either side of it."""
     curve = ResponseCurve("five_segment", b=(0.12, 0.14), c=(0.62, 0.88), y_max=1.0)
     assert curve.light_range[0] < -0.05
     channels = [np.full((40, 60), light, np.float32) for light in (-0.05, 0.1, 0.3)]
@@ -530,8 +536,8 @@ def test_light_that_agrees_is_left_alone_below_nothing_too() -> None:
     np.testing.assert_allclose(without_negative_light(blurred, luma, along, 2, 2), luma, atol=1e-4)
 
 
-def test_waves_on_dark_ground_shrink_to_the_grounds_own_light() -> None:
-    """Waves as long as the path leave no trace in the record; cut off at 0, they would brighten the ground."""
+def test_waves_in_dark_areas_shrink_to_the_mean_light() -> None:
+    """Waves as long as the path are invisible in the record; clipping them at 0 would brighten the area."""
     blurred = _seen_along(np.linspace(-6, 6, 16)[:, None] * (1.0, 0.0), ResponseCurve("srgb"))
     light = np.full((80, 120), 0.02, np.float32)
     light[:, 60:] = 0.4 + 0.1 * np.sin(np.arange(60) * 2 * np.pi / 12)
@@ -539,6 +545,6 @@ def test_waves_on_dark_ground_shrink_to_the_grounds_own_light() -> None:
     found = without_negative_light(blurred, light, blur_along_paths(blurred, 2), 2, 2)
     assert found.min() >= 0
     waves = found[:, 12:36]
-    assert abs(waves.mean() - 0.02) < 0.005, "0.07 where the negative light is only cut off"
-    assert waves.max() < 0.08, "0.22 before"
-    np.testing.assert_allclose(found[:, 72:], light[:, 72:], rtol=1e-3)  # nothing negative within reach: as it was
+    assert abs(waves.mean() - 0.02) < 0.005, "0.07 if negative light is only clipped"
+    assert waves.max() < 0.08, "0.22 before the correction"
+    np.testing.assert_allclose(found[:, 72:], light[:, 72:], rtol=1e-3)  # no negative light within reach: unchanged

@@ -1,4 +1,4 @@
-"""How the curve's slope is told where light and dark lie together: by the noise that grey levels bring into light."""
+"""The curve's slope where light and dark meet, from the noise of grey levels in light."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _squares(dark: int, bright: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("dark", "bright"), [(20, 230), (60, 90), (128, 128)])
 def test_noise_over_slopes_is_the_noise_in_light(dark: int, bright: int, rng: np.random.Generator) -> None:
-    """Grey levels with a known noise, taken to light, have the noise that their slopes foretell."""
+    """Grey levels with a known noise, converted to light, have the noise that their slopes predict."""
     curve, clean = ResponseCurve("srgb"), _squares(dark, bright)
     grey = np.clip(np.rint(clean + rng.normal(0, NOISE_LEVELS, clean.shape)), 0, 255).astype(np.uint8)
     slopes = _blurred(curve, grey).slopes(1, SIDE_PX, (311, 203))
@@ -37,8 +37,8 @@ def test_noise_over_slopes_is_the_noise_in_light(dark: int, bright: int, rng: np
     assert NOISE_LEVELS / slopes[60:-60, 60:-60] == pytest.approx(in_light, rel=0.12)
 
 
-def test_a_pixels_own_slope_is_that_of_its_level() -> None:
-    """In the middle of a square the neighbourhood is all of one level."""
+def test_a_pixel_s_slope_is_that_of_its_level() -> None:
+    """In the middle of a square the neighbourhood has only one level."""
     curve, grey = ResponseCurve("srgb"), _squares(30, 200).astype(np.uint8)
     slopes = _blurred(curve, grey).slopes(1, 5, (311, 203))
     for row, column in ((104, 104), (104, 114)):
@@ -46,8 +46,8 @@ def test_a_pixels_own_slope_is_that_of_its_level() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_levels_that_tell_no_light_have_their_neighbours_slope(level: int) -> None:
-    """Below A and above D the curve is level, and 1 / s² would be next to infinite."""
+def test_censored_levels_have_their_neighbours_slope(level: int) -> None:
+    """Below A and above D the curve is flat, and 1 / s² would be nearly infinite."""
     curve = ResponseCurve("five_segment", b=(0.12, 0.08), c=(0.62, 0.80), y_max=0.93)
     slopes = _blurred(curve, np.full((203, 311), level, np.uint8)).slopes(1, SIDE_PX, (311, 203))
     assert np.isfinite(slopes).all()
@@ -55,8 +55,8 @@ def test_levels_that_tell_no_light_have_their_neighbours_slope(level: int) -> No
     assert slopes.max() <= curve.slope_table().max()
 
 
-def test_dark_squares_beside_bright_ones_get_no_noise_from_them(rng: np.random.Generator) -> None:
-    """The noise of what is bright is not taken for detail of what is dark: a tile has one slope."""
+def test_a_tile_has_one_slope(rng: np.random.Generator) -> None:
+    """Noise of bright squares must not be treated as detail of dark ones."""
     grey = np.clip(_squares(20, 230) + rng.normal(0, NOISE_LEVELS, (203, 311)), 0, 255).astype(np.uint8)
     even = _blurred(ResponseCurve("srgb"), grey).slopes(1, 104, (311, 203))
     assert even.max() < 1.1 * even.min()
