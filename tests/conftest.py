@@ -1,4 +1,4 @@
-"""What all tests share: real captures where there are any, the program as a process, fast tests first."""
+"""Shared by all tests: real captures if available, the program as a process, and the order of tests."""
 
 import gc
 import importlib
@@ -27,16 +27,16 @@ SHARING = {"blur_length_check", "calibrate_command", "calibrate_stories", "calib
 LONGEST = ("calibrate_stories", "real_captures", "translation", "neighbours", "pages", "fields", "diagnose_stories",
            "evaluate_slam", "diagnose_again", "diagnose_command", "cli", "urls", "crashes", "restoration_quality",
            "curve_matters")  # fmt: skip
-"""Files of scenarios by their longest part that one process runs, 80 s to 10 s: begun last, it would run alone."""
+"""Files of scenarios by their longest part in one process, 80 s to 10 s: started last, it would run alone."""
 
 
 def pytest_configure() -> None:
-    """Give each of xdist's processes, and all that it starts, a core of its own: they are the parallelism already.
+    """Give each xdist process, and everything it starts, one core, since the processes are the parallelism.
 
-    A program that shares its work out over the cores it finds would start and load processes of its own in every test;
-    those that test this say so.  Freed memory is kept, as the program does.  While tests are collected hardly anything
-    becomes garbage.  Compiled code is kept even where a machine says otherwise: each of the many programs that the
-    tests start would compile the package anew.
+    A program that uses all cores would start and load processes of its own in every test; tests of that behaviour ask
+    for it. Freed memory is kept, as in the program. Garbage collection is off while tests are collected, which makes
+    hardly any garbage. Compiled code is written even if the machine forbids it; otherwise each of the many programs
+    started by the tests would compile the package anew.
     """
     gc.disable()
     keep_freed_memory()
@@ -49,7 +49,7 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the fast tests first, then the scenarios, the longest before the others."""
+    """Run fast tests first, then scenarios, the longest ones before the others."""
     rank = {f"test_{name}": k for k, name in enumerate(LONGEST)}
 
     def order(item: pytest.Item) -> tuple[bool, int]:
@@ -60,7 +60,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Search for garbage from here on only, not among what was collected, and not after every 700 new objects."""
+    """Collect garbage from here on, without the collected tests, and less often than every 700 new objects."""
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
     gc.enable()
@@ -68,7 +68,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Hand a file whose tests share captures to one process, all other tests one by one."""
+    """Give a file whose tests share captures to one process, and all other tests one by one."""
     if config.getvalue("dist") != "loadgroup":
         return None
     scheduler = importlib.import_module("xdist.scheduler")
@@ -83,7 +83,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @pytest.fixture(scope="session")
 def realdata() -> Path:
-    """Folder of the real captures; tests that need it are skipped without it."""
+    """Folder of the real captures; without it the tests that need it are skipped."""
     folder = os.environ.get("VIREST_REALDATA")
     if not folder or not Path(folder).is_dir():
         pytest.skip("VIREST_REALDATA names no folder of real captures")
@@ -92,16 +92,17 @@ def realdata() -> Path:
 
 @pytest.fixture(scope="session")
 def fork_server() -> Iterator[ForkServer]:
-    """A process that has imported the program and forks it for each call."""
+    """A process that has imported the program and forks for each call."""
     with ForkServer() as server:
         yield server
 
 
 @pytest.fixture(scope="session")
 def virest(fork_server: ForkServer) -> RunVirest:
-    """The program as its users run it: ``virest("process", folder)`` gives returncode, stdout, stderr.
+    """The program as its users run it: ``virest("process", folder)`` returns returncode, stdout, stderr.
 
-    Forked from a process that has imported it already, where that can be; with variables of its own it is started anew.
+    The call is forked from a process that has imported the program, if the platform can fork; with environment
+    variables of its own it is started anew.
     """
 
     def run(*arguments: object, cwd: Path | None = None, stdin: str = "", timeout: float = 1200, **environment: str):

@@ -1,4 +1,4 @@
-"""The README and docs/ as the tests read them: pages, fences, sessions, links and headings."""
+"""The README and docs/ as read by the tests: pages, fences, sessions, links and headings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PAGES = [README, *sorted(DOCS.rglob("*.md"))]
 
 @dataclass(frozen=True)
 class Fence:
-    """One fenced block: the page, its language, its text."""
+    """One fenced block: its page, language and text."""
 
     page: Path
     language: str
@@ -22,12 +22,12 @@ class Fence:
 
 
 def read(page: Path) -> str:
-    """A page's text."""
+    """The text of a page."""
     return page.read_text(encoding="utf-8")
 
 
 def name_of(page: Path) -> str:
-    """A page's path below the repository."""
+    """Path of a page in the repository."""
     return page.relative_to(ROOT).as_posix()
 
 
@@ -43,20 +43,20 @@ def prose(page: Path) -> str:
 
 
 def typed_lines(fence: Fence) -> list[str]:
-    """What a reader would type: of a session only the lines behind a prompt, of a script all of them."""
+    """Lines that a reader would type: those after a prompt in a session, all lines of a script."""
     lines = fence.text.replace("\\\n", " ").splitlines()
     prompted = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
     return prompted or ([] if fence.language == "console" else lines)
 
 
 def links(page: Path) -> list[str]:
-    """Targets of links and pictures of a page, other hosts' left out."""
+    """Targets of the links and pictures of a page, without those on other hosts."""
     found = re.findall(r"\]\(([^)\s]+)\)", prose(page))
     return [target for target in found if not re.match(r"[a-z]+:", target)]
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors of a page's headings, as GitHub and mkdocs make them."""
+    """The anchors of a page's headings, as made by GitHub and mkdocs."""
     headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
     words = [re.sub(r"[^\w\- ]", "", heading.lower().replace("`", "")) for heading in headings]
     return {re.sub(r" +", "-", word.strip()) for word in words}

@@ -1,7 +1,7 @@
-"""``python -m virest`` without the second of imports: a process that has loaded the package forks one for each call.
+"""``python -m virest`` without a second of imports: a process that has loaded the package forks for each call.
 
-The forked process is what the program is when it starts: arguments, folder, variables, standard streams and exit code.
-What a start itself does (lazy imports, variables that libraries read as they load) is tested by true starts.
+The forked process has the state of the program at its start: arguments, folder, variables, standard streams and exit
+code. What a real start adds (lazy imports, variables that libraries read when loaded) is tested by real starts.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from types import TracebackType
 from typing import IO, NoReturn
 
 LAZY = ("pandas", "typer._adapters", "pydantic.type_adapter", "matplotlib.figure", "matplotlib.backends.backend_agg")
-"""Modules that the program loads only once a table is read, an option is checked, a figure is drawn."""
+"""Modules that the program loads only when it reads a table, checks an option or draws a figure."""
 MOST_BYTES = 1 << 20
-"""Longest call: arguments and variables."""
+"""Largest call: arguments and variables."""
 LONGEST_S = 1200.0
-"""Most time of a call out of a shell."""
+"""Longest call from a shell."""
 
 
 class ForkServer:
@@ -52,7 +52,7 @@ class ForkServer:
             self.folder.cleanup()
 
     def address(self) -> str:
-        """Where the server listens; it is started by the first who asks."""
+        """The address of the server; the first use starts it."""
         if self.folder is None:
             self.folder = tempfile.TemporaryDirectory()
             self.process = subprocess.Popen(
@@ -64,14 +64,14 @@ class ForkServer:
         return os.path.join(self.folder.name, "calls")
 
     def shell_function(self) -> dict[str, str]:
-        """The variable by which every bash below takes ``virest`` for a call of the server."""
+        """The variable that makes every bash started with it run ``virest`` as a call of the server."""
         client = shlex.join([sys.executable, "-SE", __file__, "call", self.address()])
         return {"BASH_FUNC_virest%%": f'() {{ {client} "$@"; }}'}
 
     def run(
         self, arguments: list[str], cwd: Path | None, stdin: str, timeout: float
     ) -> subprocess.CompletedProcess[str]:
-        """Run the program with arguments in a folder; its exit code and what it wrote. After ``timeout`` s it ends."""
+        """Run the program in a folder; return exit code and output. After ``timeout`` s it is terminated."""
         with contextlib.ExitStack() as files:
             streams = [files.enter_context(tempfile.TemporaryFile("w+")) for _ in range(3)]
             streams[0].write(stdin)
@@ -83,7 +83,7 @@ class ForkServer:
 
 
 def called(address: str, arguments: list[str], cwd: str, streams: Sequence[IO[str]], timeout: float) -> int:
-    """Have the server run the program with these standard streams; its exit code."""
+    """Make the server run the program with these standard streams; return its exit code."""
     call = {"arguments": arguments, "cwd": cwd, "s": timeout, "environment": dict(os.environ)}
     with socket.socket(socket.AF_UNIX) as server:
         server.connect(address)
@@ -92,7 +92,7 @@ def called(address: str, arguments: list[str], cwd: str, streams: Sequence[IO[st
 
 
 def serve(address: str) -> None:
-    """Fork a program for each call, and answer its status."""
+    """Fork the program for each call and send its status back."""
     for name in LAZY:
         importlib.import_module(name)
     package = importlib.import_module("virest")
@@ -111,7 +111,7 @@ def serve(address: str) -> None:
 
 
 def answer(connection: socket.socket) -> None:
-    """Fork a program for one call, wait for it, and answer its status."""
+    """Fork the program for one call, wait for it, and send its status back."""
     with connection:
         text, streams, _, _ = socket.recv_fds(connection, MOST_BYTES, 3)
         while not text.endswith(b"\n"):
@@ -129,7 +129,7 @@ def answer(connection: socket.socket) -> None:
 
 
 def become(arguments: list[str], cwd: str, streams: Sequence[int]) -> NoReturn:
-    """Be the program from here on."""
+    """Turn the forked process into the program."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(cwd)
     for number, stream in enumerate(streams):
@@ -150,9 +150,9 @@ def become(arguments: list[str], cwd: str, streams: Sequence[int]) -> NoReturn:
 
 
 def leave(code: int) -> NoReturn:
-    """End as the interpreter does, but for taking apart all that is loaded: that is a tenth of a second.
+    """End as the interpreter does, without the tenth of a second for clearing modules.
 
-    What a library raises at the end is ignored, as by the interpreter: executors of 3.11 may wake a closed pipe.
+    Exceptions of libraries at exit are ignored, as in the interpreter: executors of 3.11 may wake a closed pipe.
     """
     with contextlib.suppress(OSError):
         threading._shutdown()  # type: ignore[attr-defined]

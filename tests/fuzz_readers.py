@@ -1,10 +1,10 @@
-"""Coverage-guided fuzzing of the readers, beside the suite: needs `pip install atheris`.
+"""Coverage-guided fuzzing of the readers, outside the test suite; needs `pip install atheris`.
 
 $ PYTHONPATH=. python tests/fuzz_readers.py FINDINGS [movie|text] [libFuzzer's options, such as -max_total_time=600]
 
-Each input is written to a file and read.  A `VirestError` of one line is an answer; anything else is a finding: kept
-once for each place in the code, with its input, in the folder FINDINGS.  libFuzzer itself ends at a hang or at too much
-memory.
+Each input is written to a file and read.  A `VirestError` of one line is a valid answer; anything else is a finding.
+The folder FINDINGS keeps each finding with its input, once for each place in the code.  libFuzzer itself stops at a
+hang or at excessive memory.
 """
 
 import logging
@@ -50,14 +50,14 @@ settings.settings_model = lru_cache(settings.settings_model)  # the form is the 
 
 
 def read_movie(path: Path) -> None:
-    """Index a movie, and decode a few of its frames."""
+    """Index a movie and decode a few of its frames."""
     index = probe_movie(path)
     for _ in read_gray(path, index, range(3)):
         pass
 
 
 def mutate_movie(data: bytes, max_size: int, seed: int) -> bytes:
-    """Change numbers in the movie's tables, which are few of its bytes; every fourth time anything anywhere."""
+    """Change numbers in the movie's tables, which are few of its bytes; every fourth time change anything."""
     start = data.find(b"moov")
     if start < 0 or len(data) - start < 16 or seed % 4 == 0:
         return bytes(atheris.Mutate(data, max_size))
@@ -75,12 +75,12 @@ def read_gyroflow_log(path: Path) -> None:
 
 
 def read_sensor(path: Path) -> None:
-    """Read EuRoC's description of a camera; its YAML's own faults are settings errors."""
+    """Read EuRoC's description of a camera; errors of its YAML are settings errors."""
     parse_sensor(load_yaml_mapping(path), np.eye(4), path.name, MOVIE, [])
 
 
 def read_run(path: Path) -> None:
-    """Look at a run's folder whose state is the input."""
+    """Inspect a run folder whose state is the input."""
     run = RunFolder(FOLDER / "run")
     run.frames.mkdir(parents=True, exist_ok=True)
     run.segments.mkdir(exist_ok=True)
@@ -121,7 +121,7 @@ def keep_finding(findings: Path, name: str, data: bytes) -> None:
 
 
 def main() -> None:
-    """Run libFuzzer over the movie reader, or over all others."""
+    """Run libFuzzer over the movie reader, or over all other readers."""
     findings, what, options = Path(sys.argv[1]), sys.argv[2], sys.argv[3:]
     findings.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("ignore")

@@ -1,7 +1,7 @@
-"""Laws that every operator obeys, written once, and the moving camera that they are tried on.
+"""Laws of all operators, written once, and the moving camera used to test them.
 
-The camera's truth comes from SciPy's rotations at a constant rate; nothing of the code under test is used but its
-records, so a sign that is wrong twice does not cancel.
+The camera's truth comes from SciPy's rotations at a constant rate. Of the code under test only the records are used, so
+a sign error made twice does not cancel.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RADTAN = ("radtan", (-0.11, 0.03, 0.0013, -0.0021, -0.004))
 FISHEYE = ("fisheye", (0.03, -0.012, 0.004, -0.001))
 UNDISTORTED = ("none", ())
 R_CAM_IMU = Rotation.from_rotvec([0.3, -1.1, 2.0])
-"""No axis of the phone lies along one of the camera."""
+"""None of the phone's axes is along one of the camera's."""
 
 
 # ── laws ─────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -43,7 +43,7 @@ def random_picture(shape: Shape, rng: np.random.Generator) -> NDArray[np.float32
 
 
 def assert_linear(operator: Operator, shape: Shape, rng: np.random.Generator, rtol: float = 1e-4) -> None:
-    """Hold A(2.5 x − 0.7 y) = 2.5 A x − 0.7 A y."""
+    """Check A(2.5 x − 0.7 y) = 2.5 A x − 0.7 A y."""
     x, y = random_picture(shape, rng), random_picture(shape, rng)
     a, b = np.float32(2.5), np.float32(-0.7)
     expected = a * operator(x) + b * operator(y)
@@ -53,7 +53,7 @@ def assert_linear(operator: Operator, shape: Shape, rng: np.random.Generator, rt
 def assert_adjoint(
     apply: Operator, adjoint: Operator, x_shape: Shape, y_shape: Shape, rng: np.random.Generator, rtol: float = 1e-4
 ) -> None:
-    """Hold <A x, y> = <x, Aᵀ y>, with the shapes that are claimed."""
+    """Check <A x, y> = <x, Aᵀ y> and the given shapes."""
     x, y = random_picture(x_shape, rng), random_picture(y_shape, rng)
     forward, back = apply(x), adjoint(y)
     assert forward.shape == y_shape
@@ -63,14 +63,14 @@ def assert_adjoint(
 
 
 def assert_round_trip(there: Operator, back: Operator, values: Array, atol: float) -> None:
-    """Go there and come back: nothing changes."""
+    """Check that applying an operator and its inverse changes nothing."""
     np.testing.assert_allclose(back(there(values)), values, rtol=0, atol=atol)
 
 
 def assert_energy(
     apply: Operator, adjoint: Operator, x_shape: Shape, y_shape: Shape, rng: np.random.Generator, rtol: float = 1e-4
 ) -> None:
-    """Make and lose no light: a constant stays, and the adjoint keeps the sum."""
+    """Check that the operator neither makes nor loses light: a constant stays, and the adjoint keeps the sum."""
     np.testing.assert_allclose(apply(np.full(x_shape, 0.37, np.float32)), np.full(y_shape, 0.37), rtol=rtol)
     y = random_picture(y_shape, rng)
     assert abs(float(adjoint(y).sum(dtype=float) - y.sum(dtype=float))) <= rtol * float(np.abs(y).sum(dtype=float))
@@ -81,7 +81,7 @@ def assert_energy(
 
 @dataclass(frozen=True)
 class TurningCamera:
-    """A phone that turns at a constant rate and moves at a constant velocity, seen by hand-made formulas."""
+    """A phone with a constant turn rate and a constant velocity, calculated by hand-made formulas."""
 
     profile: CameraProfile
     rate_rad_s: tuple[float, float, float] = (0.35, -0.8, 0.5)
@@ -104,16 +104,16 @@ class TurningCamera:
 
     @property
     def motion(self) -> RowMotion:
-        """What the package makes of it."""
+        """The package's row motion for this camera."""
         translation = None
         if self.velocity_m_s is not None:
             translation = FrameTranslation(np.array(self.velocity_m_s), np.zeros(3), np.zeros(3))
         return row_motion(self.trajectory, self.profile, self.stamp_s, self.exposure_s, self.reference, translation)
 
     def seen(self, points_px: Array, from_s: Any, to_s: Any, reference_s: float, depth_m: float = np.inf) -> Array:
-        """Truth: pixels (n, 2) at ``to_s`` of what is seen at pixels (n, 2) at ``from_s``, times (n,) or scalars.
+        """Truth: pixels (n, 2) at ``to_s`` of points at pixels (n, 2) at ``from_s``, times (n,) or scalars.
 
-        World axes = camera axes at reference_s; a point lies at depth_m along the optical axis at ``from_s``.
+        World axes are the camera axes at reference_s; a point is at depth_m along the optical axis at ``from_s``.
         """
         lens, rate = self.profile.intrinsics, np.array(self.rate_rad_s)
         assert lens is not None
@@ -148,7 +148,7 @@ def phone(
     readout_direction: str = "top_to_bottom",
     **changes: Any,
 ) -> CameraProfile:
-    """Make a phone with an off-centre lens, pixels that are not square, and a gyroscope with bias and scale."""
+    """Make a phone with an off-centre lens, non-square pixels, and a gyroscope with bias and scale."""
     model, coefficients = lens
     centre = (0.52 * width, 0.47 * height)
     return CameraProfile(
@@ -179,7 +179,7 @@ def texture(height: int, width: int, seed: int = 7, slope: float = 1.1) -> NDArr
 
 
 def psnr_db(picture: Array, truth: Array, border: int = 0) -> float:
-    """Peak signal to noise for pictures with peak 255, without a border."""
+    """PSNR for pictures with a peak of 255, without a border."""
     inner = (slice(border, -border or None),) * 2
     error = np.asarray(picture, float)[inner] - np.asarray(truth, float)[inner]
     return float(10 * np.log10(255.0**2 / np.mean(error**2)))
@@ -191,7 +191,7 @@ def recorded_points(motion: RowMotion, points_px: Array, anchor: float = 0.0) ->
 
 
 class AtDepth:
-    """A motion before points of these inverse depths, 1/m, in the axes in which they are looked at first."""
+    """A motion in front of points with these inverse depths, 1/m, in the axes of their first observation."""
 
     def __init__(self, motion: RowMotion, inverse_depth: Array | float) -> None:
         self.motion, self.nearness = motion, np.asarray(inverse_depth, float)
@@ -201,5 +201,5 @@ class AtDepth:
         return getattr(self.motion, name)
 
     def inverse_depth(self, rays: Array, time_s: Any) -> Array:
-        """The same at any time."""
+        """The inverse depths, which are the same at any time."""
         return np.broadcast_to(self.nearness, rays.shape[:-1])

@@ -1,9 +1,9 @@
-"""Which small faults no fast test notices: a random sample of mutants (Cosmic Ray), judged by the tests of their lines.
+"""Find small faults that no fast test notices, with random mutants (Cosmic Ray) judged by the tests of their lines.
 
     make mutants ARGS="--rooms image_formation --count 40 --seed 1"
 
-A room's fast tests run once under coverage, which tells for each line the tests that run it, and how long these take.
-A mutant is then judged by the quickest of them, up to a limit of time.  Works on a copy of the last commit.
+A room's fast tests run once under coverage, which gives the tests of each line and the time that each test takes.
+The quickest of them then judge a mutant, up to a time limit.  The program works on a copy of the last commit.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from tqdm import tqdm
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("image_formation", "restoration", "diagnosis")
 TELLING = {"Add", "Sub", "Mul", "Div", "Pow", "Lt", "LtE", "Gt", "GtE", "Eq", "NotEq"}
-"""Operands of the replacements that are tried: changing a product to a shift of bits ends in an error at once."""
+"""Operands of the replacements tried. Changing a product to a bit shift, for example, fails at once."""
 OTHERS = {"NumberReplacer", "AddNot", "ReplaceUnaryOperator_Delete_USub", "ReplaceBreakWithContinue"}
 OTHERS |= {"ReplaceOrWithAnd", "ReplaceAndWithOr", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue"}
 TRACED = 2.0
-"""How many times longer a test takes under coverage, about."""
+"""Approximate factor by which coverage slows a test down."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def covering_tests(copy: Path, room: str) -> tuple[dict[tuple[str, int], set[str]], dict[str, float]]:
-    """A room's fast tests by (file, line), and the seconds that each takes."""
+    """The fast tests of a room by (file, line), and the seconds that each takes."""
     options = ["-m", "not scenario", "-n", "0", "--cov-context=test", "--cov-report=", "--junitxml=times.xml"]
     run(copy, [f"tests/{room}", f"--cov=virest/{room}", *options], timeout=None)
     data = CoverageData(str(copy / ".coverage"))
@@ -79,7 +79,7 @@ def covering_tests(copy: Path, room: str) -> tuple[dict[tuple[str, int], set[str
 
 
 def sampled(copy: Path, room: str, count: int, seed: int) -> list[Mutant]:
-    """Some of a room's mutants, each file by the number that it has."""
+    """Some of a room's mutants, in proportion to the number in each file."""
     config, session = copy / "mutants.toml", copy / "mutants.sqlite"
     config.write_text(
         f'[cosmic-ray]\nmodule-path = "virest/{room}"\ntimeout = 1.0\nexcluded-modules = []\ntest-command = "true"\n'
@@ -125,7 +125,7 @@ def judged(
 
 
 def run(copy: Path, arguments: list[str], timeout: float | None) -> int:
-    """Run pytest in the copy; a mutant that takes too long is noticed."""
+    """Run pytest in the copy; a mutant that takes too long counts as noticed."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
     threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
     environment = {**os.environ, **threads, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -138,7 +138,7 @@ def run(copy: Path, arguments: list[str], timeout: float | None) -> int:
 
 
 def print_room(room: str, mutants: list[Mutant], verdicts: list[tuple[str, str]]) -> None:
-    """Print how many were noticed, and each that was not."""
+    """Print the number of mutants with each verdict, and each mutant that was not noticed."""
     counts = {kind: sum(verdict == kind for verdict, _ in verdicts) for kind in sorted({v for v, _ in verdicts})}
     print(f"{room}: {len(mutants)} mutants: " + ", ".join(f"{count} {kind}" for kind, count in counts.items()))
     for mutant, (verdict, difference) in zip(mutants, verdicts, strict=True):

@@ -1,4 +1,4 @@
-"""Errors: stable exit codes, one line of text, and nothing lost on the way out of a process."""
+"""Errors have stable exit codes and one line of text, and cross a process border completely."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _tree() -> list[type[VirestError]]:
 
 
 def test_exit_codes_are_those_of_the_contract() -> None:
-    """Each kind of error ends the program with the code that the contract fixes, and no kind is missing."""
+    """Each kind of error has the exit code of the contract, and no kind is missing."""
     assert {kind.__name__: kind.exit_code for kind in _tree()} == EXIT_CODES
 
 
@@ -44,15 +44,15 @@ def test_the_drawn_tree_shows_every_error() -> None:
 
 
 def test_video_imu_and_clock_errors_are_capture_errors() -> None:
-    """Whoever catches a capture's error catches those of its parts."""
+    """Catching a capture's error catches those of its parts."""
     assert all(
         issubclass(kind, errors.CaptureError) for kind in (errors.VideoError, errors.ImuError, errors.ClockError)
     )
 
 
 @pytest.mark.parametrize("kind", _tree())
-def test_an_error_crosses_a_process_border_whole(kind: type[VirestError]) -> None:
-    """Pickling keeps the kind, the message, the hint and the facts."""
+def test_an_error_survives_pickling(kind: type[VirestError]) -> None:
+    """Pickling keeps kind, message, hint and facts."""
     error = kind("12 of 40 rows fall", hint="cut the file", rows=12, where=("a.csv", 3))
     copy = pickle.loads(pickle.dumps(error))
     assert type(copy) is kind
@@ -63,7 +63,7 @@ def test_an_error_crosses_a_process_border_whole(kind: type[VirestError]) -> Non
 
 @pytest.mark.parametrize("kind", _tree())
 def test_the_text_is_one_line_of_message_and_hint(kind: type[VirestError]) -> None:
-    """An error reads as one line: what, then what to do next."""
+    """An error reads as one line: the problem, then the next step."""
     assert str(kind("the file is cut", hint="copy it again")) == "the file is cut; copy it again"
     assert str(kind("the file is cut")) == "the file is cut"
     assert len(str(kind("a", hint="b", n=1)).splitlines()) == 1

@@ -1,4 +1,4 @@
-"""The documentation's Python and the notebook run, and what they say comes out."""
+"""The Python blocks of the documentation and the notebook run and give the stated results."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ PYTHON = [fence for page in (README, DOCS / "python.md") for fence in fences(pag
 
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder with the samples, as a reader would have them."""
+    """A folder with the samples, as a reader would have it."""
     (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -21,13 +21,13 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("number", range(len(PYTHON)))
 def test_a_python_block_runs(number: int, workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each block stands on its own and prints what it shows."""
+    """Each block runs alone and prints output if it calls print."""
     exec(compile(PYTHON[number].text, str(PYTHON[number].page), "exec"), {})
     assert "print(" not in PYTHON[number].text or capsys.readouterr().out
 
 
 def test_the_notebook_runs(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From a capture to a restored frame, residuals and an extended profile that has the hidden readout time."""
+    """It leads from a capture to a restored frame, and to an extended profile with the hidden readout time."""
     mpl.use("Agg")
     notebook = json.loads((ROOT / "examples" / "capture_to_profile.ipynb").read_text("utf-8"))
     names: dict[str, Any] = {}

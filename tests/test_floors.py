@@ -1,4 +1,4 @@
-"""The floors of the house: a file imports only from lower ones, and only some rooms touch files or print."""
+"""The floors of the architecture: a file imports only from lower ones, and only some rooms open files or print."""
 
 import ast
 from functools import cache
@@ -27,7 +27,7 @@ STRANGERS = {
     "image_formation": {"simulation"},
     "inference": {"simulation"},
 }
-"""The judge does not read the accused's notes."""
+"""Rooms that a room must not import although they are lower, so that a result never depends on the code it checks."""
 ROOT_FILES = {"__init__.py", "__main__.py", "arrays.py", "errors.py"}
 MAY_OPEN_ROOMS = {"capture", "report", "app"}
 MAY_OPEN_FILES = {"camera/profile_file.py", "camera/yaml_mapping.py", "camera/kalibr.py", "simulation/recording.py"}
@@ -37,13 +37,13 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 
 
 def room_of(path: Path) -> str:
-    """The room of a file of the package; the file's own name at the top level."""
+    """The room of a file of the package; at the top level, the name of the file."""
     parts = path.relative_to(PACKAGE).parts
     return parts[0] if len(parts) > 1 else path.stem
 
 
 def imported_rooms(tree: ast.AST) -> set[str]:
-    """Rooms of virest that a file imports from, inside functions too."""
+    """Rooms of virest that a file imports from, also inside functions."""
     names: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -67,30 +67,30 @@ def calls(tree: ast.AST) -> set[str]:
 
 @cache
 def parse(path: Path) -> ast.Module:
-    """Read a file's syntax tree."""
+    """Read the syntax tree of a file."""
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
 def identify(path: Path) -> str:
-    """Name a file by its place in the package."""
+    """Path of a file in the package."""
     return path.relative_to(PACKAGE).as_posix()
 
 
 def test_a_file_imports_only_from_lower_floors() -> None:
-    """A file imports from its own room and from lower floors, and never from a stranger."""
+    """A file imports from its own room and from lower floors, without the excluded rooms."""
     for path in FILES:
         room = room_of(path)
         if path.parent == PACKAGE and room not in ("arrays", "errors"):
-            assert path.name in ROOT_FILES, f"{path.name} belongs into a room"
+            assert path.name in ROOT_FILES, f"{path.name} belongs in a room"
             continue
-        assert room in FLOOR, f"{room} is no room of architecture.md"
+        assert room in FLOOR, f"architecture.md has no room {room}"
         for other in imported_rooms(parse(path)) - {room}:
             assert FLOOR[other] < FLOOR[room], f"{identify(path)} (floor {FLOOR[room]}) imports {other}"
             assert other not in STRANGERS.get(room, set()), f"{identify(path)} imports {other}"
 
 
-def test_no_file_imports_by_a_relative_path() -> None:
-    """Imports name the room, so that the floors can be read off them."""
+def test_no_import_is_relative() -> None:
+    """Absolute imports name the room, so that floors can be checked."""
     relative = [
         identify(path)
         for path in FILES
@@ -100,14 +100,14 @@ def test_no_file_imports_by_a_relative_path() -> None:
     assert not relative
 
 
-def test_only_the_named_rooms_open_files() -> None:
-    """Edges touch files; everything else maps records to records."""
+def test_only_the_listed_rooms_open_files() -> None:
+    """Only some rooms and files touch the file system; everything else maps records to records."""
     closed = [path for path in FILES if room_of(path) not in MAY_OPEN_ROOMS and identify(path) not in MAY_OPEN_FILES]
     assert not {identify(path): found for path in closed if (found := calls(parse(path)) & OPENERS)}
 
 
 def test_only_the_program_prints() -> None:
-    """The library is silent: it logs, and takes progress as an argument."""
+    """The library does not print: it logs, and gets progress callbacks as arguments."""
     for path in FILES:
         if room_of(path) == "app":
             continue
@@ -120,8 +120,8 @@ def test_only_the_program_prints() -> None:
         assert "tqdm" not in imported, identify(path)
 
 
-def test_every_error_of_the_library_is_of_the_tree() -> None:
-    """Exit codes hang on the error tree: no module but errors.py defines an exception."""
+def test_every_exception_is_defined_in_errors() -> None:
+    """Exit codes depend on the error tree, so only errors.py and app/cli.py define exceptions."""
     for path in FILES:
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.ClassDef) and identify(path) not in ("errors.py", "app/cli.py"):

@@ -1,4 +1,4 @@
-"""The row clock is written once: nobody outside its file adds readout and exposure to a start by hand."""
+"""The row clock is written once: no other file adds readout and exposure to a start time."""
 
 import ast
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ READERS = [
     and room_of(path) != "simulation"
     and identify(path) != HOME
 ]
-"""The simulator keeps its own physics; camera/ and capture/ lie below the clock."""
+"""The simulator has its own physics; camera/ and capture/ are below the clock."""
 BY_HAND = {
     "row through a pixel": "start + shutter.readout_fraction(p, w, h) * shutter.readout_time_s + 0.5 * exposure_s",
     "waiting time of a row": "waited_s = profile.shutter.readout_time_s * fraction[:, None]",
@@ -42,7 +42,7 @@ ANOTHER_MATTER = {
 
 
 def _bare(node: ast.expr) -> ast.expr:
-    """What a conversion, float(...) or np.asarray(...), and an index are about."""
+    """The expression inside a conversion, float(...) or np.asarray(...), or an index."""
     while True:
         if isinstance(node, ast.Subscript):
             node = node.value
@@ -75,14 +75,14 @@ SUM = (ast.Add, ast.Sub)
 
 
 def _terms(node: ast.expr) -> list[ast.expr]:
-    """What a chain of + and − is of."""
+    """The terms of a chain of + and −."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, SUM):
         return [*_terms(node.left), *_terms(node.right)]
     return [node]
 
 
 def _factors(node: ast.expr) -> list[ast.expr]:
-    """What a chain of × is of; a division's first operand, and 1 for its second: it is no share to divide by a time."""
+    """The factors of a chain of ×. A division gives its first operand's and 1, since dividing by a time is no share."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
         return [*_factors(node.left), *_factors(node.right)]
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
@@ -99,13 +99,13 @@ def _adds_rows(node: ast.BinOp) -> bool:
 
 
 def _waits_for_rows(node: ast.BinOp) -> bool:
-    """Whether a product multiplies the readout time by a fraction that is no constant."""
+    """Whether a product multiplies the readout time by a fraction that is not constant."""
     factors = _factors(node)
     return any(map(_is_readout, factors)) and any(not _is_readout(f) and not _is_constant(f) for f in factors)
 
 
 def row_clocks(tree: ast.AST) -> Iterator[ast.expr]:
-    """Places at which a file writes the row clock by hand."""
+    """Places where a file computes the row clock by hand."""
     for node in ast.walk(tree):
         match node:
             case ast.BinOp(op=ast.Add() | ast.Sub()) if _adds_rows(node):
@@ -117,24 +117,24 @@ def row_clocks(tree: ast.AST) -> Iterator[ast.expr]:
 
 
 def test_the_row_clock_is_written_in_one_place() -> None:
-    """Files ask image_formation/row_clock.py (or RowMotion, which does) when a row is exposed."""
+    """Files get exposure times of rows from image_formation/row_clock.py, or from RowMotion, which uses it."""
     assert len(READERS) > 100
     found = [f"{identify(p)}:{node.lineno}: {ast.unparse(node)}" for p in READERS for node in row_clocks(parse(p))]
-    assert not found, "the row clock by hand; use image_formation/row_clock.py:\n" + "\n".join(found)
+    assert not found, "row clock computed by hand; use image_formation/row_clock.py:\n" + "\n".join(found)
 
 
 @pytest.mark.parametrize("written", BY_HAND.values(), ids=BY_HAND)
-def test_a_row_clock_by_hand_is_seen(written: str) -> None:
-    """Each way in which the formula was written before is found."""
+def test_a_row_clock_by_hand_is_detected(written: str) -> None:
+    """Each way of writing the formula is detected."""
     assert list(row_clocks(ast.parse(written)))
 
 
 @pytest.mark.parametrize("written", ANOTHER_MATTER.values(), ids=ANOTHER_MATTER)
-def test_what_is_no_row_clock_is_left_alone(written: str) -> None:
-    """Products and sums of the same quantities that say something else are allowed."""
+def test_other_formulas_are_allowed(written: str) -> None:
+    """Products and sums of the same quantities with another meaning are allowed."""
     assert not list(row_clocks(ast.parse(written)))
 
 
-def test_the_home_of_the_row_clock_holds_it() -> None:
-    """What is looked for is found where it belongs."""
+def test_the_row_clock_is_in_its_file() -> None:
+    """The formula is detected in its own file."""
     assert list(row_clocks(parse(PACKAGE / HOME)))

@@ -1,4 +1,4 @@
-"""What README and documentation publish is what the program prints: marked blocks, and the prose that repeats them."""
+"""Published figures are those that the program prints: marked blocks, and the prose that repeats them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from virest.app.gallery import gallery_page
 BLOCKS = [block for page in PAGES for block in pages.blocks(page)]
 SESSIONS = [block for block in BLOCKS if block.took_s is not None and block.took_s <= 45.0
             and not any("-m virest.app.bench" in command for command in block.commands)]  # fmt: skip
-"""Blocks that the tests run: those of a minute's CPU time and more, and the benches, are left to `make readme`."""
+"""Blocks that the tests run. Those of more than 45 s of CPU time, and benches, are left to `make readme`."""
 WITHOUT_INPUT = ("import", "doctor")
-"""Commands whose input the repository does not hold: a bag, the machine."""
+"""Commands without an input in the repository: a bag, the machine."""
 GALLERY = DOCS / "gallery.md"
-"""Written as a whole by `make figures`."""
+"""Written completely by `make figures`."""
 FIGURE = re.compile(
     r"([-+−]?\d[\d,.]*)(?:(?:\s(?:to|and|or)\s|–)([-+−]?\d[\d,.]*))?\s?(?:dB|px|frames/s|°|mm|MB|%)(?!\w)"
 )
@@ -50,40 +50,40 @@ SETTINGS = {
     "10 %": "the deviation below which a scale of travel is taken; an example in the FAQ",
     "6 MB": "a report's pages",
 }
-"""Settings and limits of the program, with what they are: no measurement."""
+"""Settings and limits of the program with their meanings, which are not measurements."""
 FROM_PAPERS = {"0.02°": "Ye et al. 2026, doi:10.3390/s26041189, Table 2", "0.21°": "the same, its baseline"}
 
 
 def label(block: pages.Block) -> str:
-    """A block's page and last command."""
+    """Page and last command of a block."""
     return f"{name_of(block.page)}: {block.commands[-1].splitlines()[0][:60]}"
 
 
-def test_every_mark_is_a_block() -> None:
-    """No comment was mistyped: what begins also ends, and it is found."""
+def test_every_mark_belongs_to_a_block() -> None:
+    """No comment is mistyped: each block that begins also ends, and is found."""
     for mark in ("figures", "end"):
         assert sum(len(re.findall(rf"^<!-- {mark}:", read(page), re.MULTILINE)) for page in PAGES) == len(BLOCKS) > 20
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=label)
 def test_a_block_was_printed_by_this_version(block: pages.Block) -> None:
-    """Published figures are those of this version; `make readme` brings them up to date."""
+    """Published figures are those of this version; `make readme` updates them."""
     if block.took_s is None and block.needs:
-        assert not block.output, "figures stand there that no run of this command wrote"
+        assert not block.output, "the block shows figures that no run of this command wrote"
         pytest.skip(f"shows no figures yet: needs {', '.join(block.needs)}")
     assert block.version == __version__
-    assert block.output.strip(), "never run"
+    assert block.output.strip(), "the block was never run"
 
 
 @pytest.mark.scenario
 @pytest.mark.skipif(shutil.which("jq") is None, reason="some blocks pipe into jq")
 @pytest.mark.parametrize("block", SESSIONS, ids=label)
-def test_a_session_prints_what_the_page_says(
+def test_a_session_prints_what_the_page_shows(
     block: pages.Block, fork_server: ForkServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The commands of a block are run from an empty folder; clocks and last digits may differ.
+    """The commands of a block run in an empty folder; clock times and last digits may differ.
 
-    Those of the README are started as a reader starts them, the others are forked.
+    Commands of the README are started as a reader starts them; the others are forked.
     """
     if block.page != README:
         for name, value in fork_server.shell_function().items():
@@ -92,7 +92,7 @@ def test_a_session_prints_what_the_page_says(
 
 
 def helps(command: Any) -> Iterator[str]:
-    """Help texts of all commands, with those of commands inside commands."""
+    """Help texts of all commands, including subcommands."""
     for name, inner in getattr(command, "commands", {}).items():
         if name not in WITHOUT_INPUT:
             yield inner.help or ""
@@ -100,7 +100,7 @@ def helps(command: Any) -> Iterator[str]:
 
 
 def quotes(session: str) -> list[str]:
-    """What a session of a help text shows as printed: one line each, up to what is left out (...)."""
+    """The printed lines of a session in a help text, each up to an omission (...)."""
     outputs = "".join(output for _, output in pages.steps(inspect.cleandoc(session)))
     lines = [line.partition("...")[0] for line in outputs.splitlines()]
     return [" ".join(line.split()) for line in lines if line.strip()]
@@ -112,7 +112,7 @@ QUOTED = [(part.split("\n")[0], quotes(part)) for text in helps(program())
 
 @pytest.mark.parametrize(("first", "lines"), QUOTED, ids=[first.strip() for first, _ in QUOTED])
 def test_help_shows_what_the_pages_show(first: str, lines: list[str]) -> None:
-    """A session of `--help` is an excerpt of a block: whatever it prints, some page prints."""
+    """A session of `--help` is an excerpt of a block: some page shows all its output."""
     shown = "\n".join(" ".join(line.split()) for block in BLOCKS for line in block.session.splitlines())
     assert not [line for line in lines if f"\n{line}" not in shown]
 
@@ -121,7 +121,7 @@ def test_help_shows_what_the_pages_show(first: str, lines: list[str]) -> None:
 
 
 def sections(page: Path) -> Iterator[tuple[list[str], list[pages.Block]]]:
-    """Pieces of prose under one heading (paragraphs, list items, rows of tables), and the blocks that stand there."""
+    """Pieces of prose under one heading (paragraphs, list items, table rows), and the blocks there."""
     for part in re.split(r"^(?=#)", read(page), flags=re.MULTILINE):
         here = [block for block in BLOCKS if block.page == page and block.session in part]
         bare = re.sub(r"^```.*?^```", "", pages.BLOCK.sub("", part), flags=re.MULTILINE | re.DOTALL)
@@ -140,14 +140,14 @@ def required(piece: str) -> str:
 
 
 def printed(number: str, output: str) -> bool:
-    """Whether some number of an output is this one, rounded as this one is; signs are words in prose."""
+    """Whether an output has this number, rounded to its digits; signs are words in prose."""
     wanted, half = abs(pages.value(number)), 0.5001 * pages.last_digit(number)
     return any(abs(abs(pages.value(found[0])) - wanted) <= half for found in pages.NUMBER.finditer(output))
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != GALLERY], ids=name_of)
-def test_a_figure_in_prose_is_printed_by_the_command_it_names(page: Path) -> None:
-    """A figure outside of blocks repeats one of a block: of its own section, or of a command that it names."""
+def test_a_figure_in_prose_is_printed_by_a_block(page: Path) -> None:
+    """A figure outside a block repeats one of a block in its section or of a command named beside it."""
     for pieces, here in sections(page):
         for piece in pieces:
             output = "\n".join([*(block.output for block in [*here, *named(piece)]), required(piece)])
@@ -158,8 +158,8 @@ def test_a_figure_in_prose_is_printed_by_the_command_it_names(page: Path) -> Non
                 assert not unknown, f"{name_of(page)}: {figure[0]!r} in {' '.join(piece.split())[:160]!r}"
 
 
-def test_the_gallery_says_what_diagnose_found() -> None:
-    """Its page is the one that `make figures` makes of the results kept beside its pictures: no figure was typed."""
+def test_the_gallery_is_generated_from_its_results() -> None:
+    """The page is the one that `make figures` makes from the results beside its pictures, with no typed figure."""
     results = json.loads((DOCS / "images" / "gallery" / "results.json").read_text("utf-8"))
     assert read(GALLERY) == gallery_page(results)
 
@@ -175,8 +175,8 @@ def test_the_gallery_says_what_diagnose_found() -> None:
         ("9 to 9.5 px", True),
     ],
 )
-def test_a_figure_is_found_as_it_is_rounded(prose: str, found: bool) -> None:
-    """As many digits as are shown must be the block's."""
+def test_a_figure_matches_as_rounded(prose: str, found: bool) -> None:
+    """All digits that are shown must be the block's."""
     numbers = [number for number in FIGURE.search(prose).groups() if number]
     assert all(printed(number, "blur 9.459 px, at 12 s") for number in numbers) == found
 
@@ -206,7 +206,7 @@ def page(tmp_path: Path) -> Path:
 
 
 def test_a_block_is_run_and_written(page: Path) -> None:
-    """Commands stay as they are, output takes the place of the old, and the machine stands below speeds."""
+    """Commands stay as they are, new output replaces the old, and the machine is given below speeds."""
     pages.main([str(page)])
     text = page.read_text()
     block = next(pages.blocks(page))
@@ -221,8 +221,8 @@ def test_a_block_is_run_and_written(page: Path) -> None:
     assert page.read_bytes() == before
 
 
-def test_a_page_that_is_out_of_date_is_found(page: Path) -> None:
-    """Another speed is the same page; another word is not."""
+def test_an_outdated_page_is_found(page: Path) -> None:
+    """Another speed does not make a page outdated; another word does."""
     pages.main([str(page)])
     page.write_text(page.read_text().replace('"walk          2.5"', '"walk          9.9"'))
     assert pages.main([str(page), "--check"]) == 0
@@ -230,8 +230,8 @@ def test_a_page_that_is_out_of_date_is_found(page: Path) -> None:
     assert pages.main([str(page), "--check"]) == 1
 
 
-def test_a_command_that_fails_writes_nothing(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A page whose command does not work any more stays as it is, and one line says why."""
+def test_a_failing_command_does_not_change_the_page(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """If a command fails, the page stays as it is, and the error gives the exit code."""
     page.write_text(page.read_text().replace("| tail -1", "| false"))
     before = page.read_bytes()
     assert pages.main([str(page)]) == 1
@@ -252,6 +252,6 @@ def test_a_command_that_fails_writes_nothing(page: Path, capsys: pytest.CaptureF
         ("a  1", "a    1", True),
     ],
 )
-def test_what_counts_as_the_same_output(shown: str, now: str, same: bool) -> None:
-    """Clocks do not count, last digits may differ, words and counts may not."""
+def test_equal_outputs_are_recognised(shown: str, now: str, same: bool) -> None:
+    """Clock times are ignored, last digits may differ, words and counts may not."""
     assert bool(pages.differences(shown, now)) != same

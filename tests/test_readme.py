@@ -1,4 +1,4 @@
-"""README, documentation and program say the same: commands, options, keys, links and examples."""
+"""README, documentation and program agree on commands, options, keys, links and examples."""
 
 import re
 import shlex
@@ -28,18 +28,18 @@ OTHER_TOOLS = {"--constraint", "--editable", "--depth", "--branch", "--recursive
 """Options of pip, git, dask and Slurm that a page may name."""
 MOST_BYTES = 8192
 LINE = 132
-"""Characters of an entry of the changelog: a line of a wide terminal."""
+"""Longest entry of the changelog, in characters: a line of a wide terminal."""
 SHELL = ("", "sh", "console")
 
 
 def options_of(command: Any) -> set[str]:
-    """Long options of a command and of its own commands."""
+    """Long options of a command and its subcommands."""
     own = {name for p in command.params for name in (*p.opts, *p.secondary_opts) if name.startswith("--")}
     return own.union(*(options_of(sub) for sub in getattr(command, "commands", {}).values()))
 
 
 def keys_of(model: type[BaseModel]) -> set[str]:
-    """All keys that a pydantic model takes, at any depth."""
+    """All keys of a pydantic model, at any depth."""
     keys: set[str] = set()
     for name, field in model.model_fields.items():
         keys.add(name)
@@ -50,7 +50,7 @@ def keys_of(model: type[BaseModel]) -> set[str]:
 
 
 def calls(page: Path) -> list[str]:
-    """Calls of virest in a page's fences, each without pipes, redirections and comments."""
+    """Calls of virest in a page's fences, without pipes, redirections and comments."""
     lines = [line for fence in fences(page) if fence.language in SHELL for line in typed_lines(fence)]
     found = [re.search(r"(?:^|[\s|/])(virest [a-z].*)", line) for line in lines]
     return [re.split(r"\s[|&;#>]|\s:::|\s\|\|", match.group(1))[0] for match in found if match]
@@ -62,12 +62,12 @@ def inline_calls(page: Path) -> list[str]:
 
 
 def test_the_readme_is_short() -> None:
-    """A reader has the README read in a few minutes; all else is in docs/."""
+    """A reader needs a few minutes for the README; everything else is in docs/."""
     assert len(README.read_bytes()) <= MOST_BYTES
 
 
-def test_the_changelog_says_each_change_in_a_line() -> None:
-    """In the form of Keep a Changelog, newest first; 0.1.0 lists what the program began with."""
+def test_the_changelog_has_one_line_per_change() -> None:
+    """It has the form of Keep a Changelog, newest first, above the first version 0.1.0."""
     recent, _, _ = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").partition("## [0.1.0]")
     lines = [line for line in recent.splitlines() if line][3:]
     heads = [line for line in lines if line.startswith("#")]
@@ -77,8 +77,8 @@ def test_the_changelog_says_each_change_in_a_line() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_every_example_can_be_typed(page: Path) -> None:
-    """The program's own parser takes every call of virest that a page shows."""
+def test_every_example_is_accepted_by_the_parser(page: Path) -> None:
+    """The program's own parser accepts every call of virest shown on a page."""
     for call in calls(page):
         filled = re.sub(r'("?)\$(?:\(\([^)]*\)\)|[A-Z_]+)', r"\g<1>1", call)
         words = shlex.split(filled)[1:]
@@ -92,7 +92,7 @@ def test_every_example_can_be_typed(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_command_named_in_the_text_exists(page: Path) -> None:
-    """Inline code names commands and options that there are."""
+    """Inline code names existing commands and options."""
     for call in inline_calls(page):
         words = call.split()
         assert words[1] in COMMANDS, f"{name_of(page)}: {call}"
@@ -102,7 +102,7 @@ def test_every_command_named_in_the_text_exists(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_option_named_in_the_text_exists(page: Path) -> None:
-    """An option that a page names belongs to some command, to the program, to the bench, or to `make readme`."""
+    """An option on a page belongs to a command, to the program, to the bench, or to `make readme`."""
     known = options_of(PROGRAM) | OTHER_TOOLS | {"--help", "--version", "--install-completion", "--show-completion"}
     for tool in (bench, pages):
         known |= set(
@@ -113,7 +113,7 @@ def test_every_option_named_in_the_text_exists(page: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_every_command_has_its_page_with_every_option(name: str) -> None:
-    """A command has a page of its own, the README links it, and the page names each of its options."""
+    """A command has its own page, linked from the README, that names each option."""
     page = DOCS / "commands" / f"{name}.md"
     assert f"docs/commands/{name}.md" in read(README)
     shared = {"--json", "--quiet", "--verbose", "--version", "--help"}
@@ -122,14 +122,14 @@ def test_every_command_has_its_page_with_every_option(name: str) -> None:
 
 
 def test_every_profile_and_settings_key_is_documented() -> None:
-    """A key that a YAML file may hold is named on the page of profiles."""
+    """The page on profiles names every key allowed in a YAML file."""
     page = read(DOCS / "profile.md")
     keys = keys_of(profile_schema.ProfileFile) | keys_of(settings_model())
     assert not {key for key in keys if not re.search(rf"\b{re.escape(key)}\b", page)}
 
 
 def test_every_effect_is_documented_and_in_the_gallery() -> None:
-    """Each effect has its line in the profile's table and its section in the gallery, with a picture that is there."""
+    """Each effect has a line in the profile's table, and each case a section in the gallery."""
     for name in EFFECTS:
         assert f"| `{name}` |" in read(DOCS / "profile.md")
     for name in CASES:
@@ -137,7 +137,7 @@ def test_every_effect_is_documented_and_in_the_gallery() -> None:
 
 
 def test_every_key_of_a_shown_profile_exists() -> None:
-    """A YAML block that shows a profile or settings names only known keys."""
+    """A YAML block with a profile or settings has only known keys."""
     known = keys_of(profile_schema.ProfileFile) | keys_of(settings_model())
     for fence in (fence for page in PAGES for fence in fences(page)):
         if not re.search(r"^virest_(profile|settings):", fence.text, re.MULTILINE):
@@ -149,7 +149,7 @@ def test_every_key_of_a_shown_profile_exists() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_no_link_is_dead(page: Path) -> None:
-    """A link or picture of a page leads to a file of the repository, and to a heading in it."""
+    """A link or picture leads to a file of the repository, and to a heading in it."""
     for target in links(page):
         path, _, anchor = target.partition("#")
         file = (page.parent / path).resolve() if path else page
@@ -158,7 +158,7 @@ def test_no_link_is_dead(page: Path) -> None:
 
 
 def test_the_site_lists_every_page() -> None:
-    """mkdocs.yml names each page once, and no page that is missing."""
+    """mkdocs.yml lists each page once, and no missing page."""
 
     def leaves(node: Any) -> list[str]:
         if isinstance(node, str):
@@ -170,18 +170,18 @@ def test_the_site_lists_every_page() -> None:
 
 
 def test_every_picture_of_the_site_is_shown() -> None:
-    """No picture lies in docs/ that no page shows."""
+    """docs/ has no picture that no page shows."""
     shown = {(page.parent / target).resolve() for page in PAGES for target in links(page)}
     assert not {file for file in DOCS.rglob("*.png") if file.resolve() not in shown}
 
 
 def test_the_citation_names_this_version() -> None:
-    """The version stands in the package; CITATION.cff repeats it, since no tool of citations looks there."""
+    """CITATION.cff repeats the package's version, since citation tools do not look in the package."""
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))["version"] == __version__
 
 
-def test_the_container_asks_for_extras_that_there_are() -> None:
-    """pip only warns of an extra that it does not find, and the image would lack it."""
+def test_the_containers_extras_exist() -> None:
+    """pip only warns about a missing extra, and the image would lack it."""
     offered = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
     asked = re.findall(r"'\.\[([\w,]+)\]'", (ROOT / "Dockerfile").read_text("utf-8"))
     assert len(asked) == 1

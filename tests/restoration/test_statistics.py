@@ -1,4 +1,4 @@
-"""What a blurred picture says of itself: noise and signal come back as they were put in."""
+"""Statistics of a blurred picture: known noise and signal are recovered."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STRAIGHT = ResponseCurve("linear")
 
 
 def _field(length_px: float = 15.0, angle_rad: float = 0.4) -> KernelField:
-    """Make a bent stroke that is the same everywhere, held by a grid of centres."""
+    """A curved blur path that is the same everywhere, on a grid of centres."""
     part = (np.arange(40) + 0.5) / 40
     path = np.stack([length_px * part, 0.12 * length_px * part**2], -1) @ np.array(
         [[np.cos(angle_rad), np.sin(angle_rad)], [-np.sin(angle_rad), np.cos(angle_rad)]]
@@ -33,7 +33,7 @@ def _field(length_px: float = 15.0, angle_rad: float = 0.4) -> KernelField:
 
 
 def _blurred(field: KernelField, noise_levels: float) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Blur a grey texture by the kernel and add white noise; return it and the sharp texture, grey levels."""
+    """Blur a grey texture with the kernel and add white noise; return it and the sharp texture, grey levels."""
     sharp = 255 * (0.2 + 0.6 * texture(HEIGHT, WIDTH, seed=5))
     blurred = cv2.filter2D(sharp, -1, field.arrays()[0].astype(float))
     noisy = blurred + np.random.default_rng(8).normal(0, noise_levels, sharp.shape)
@@ -41,8 +41,11 @@ def _blurred(field: KernelField, noise_levels: float) -> tuple[NDArray[np.uint8]
 
 
 @pytest.mark.parametrize("noise_levels", [0.8, 2.0, 4.0])
-def test_the_curve_of_blurred_edges_is_no_noise(noise_levels: float) -> None:
-    """Light of black and white patches is blurred, then goes through a curve: the noise is what was added after it."""
+def test_the_response_curve_at_blurred_edges_is_not_noise(noise_levels: float) -> None:
+    """Black and white patches are blurred in linear light and pass through a response curve.
+
+    The measured noise is the noise added after the curve. With a linear curve the measurement is over 1.3 times larger.
+    """
     field, curve = _field(13.0), ResponseCurve("srgb")
     light = 0.02 + 0.9 * (texture(HEIGHT, WIDTH, seed=5) > 0.5)
     grey = 255 * curve.encode(cv2.filter2D(light, -1, field.arrays()[0].astype(float)))
@@ -54,8 +57,11 @@ def test_the_curve_of_blurred_edges_is_no_noise(noise_levels: float) -> None:
 
 
 @pytest.mark.parametrize("length_px", [3.5, 5.0, 15.0])
-def test_a_coders_noise_is_bounded_by_its_step(length_px: float) -> None:
-    """What upright bars have more of across than along passes for noise under a short path; the step tells."""
+def test_the_noise_of_a_coder_is_bounded_by_its_step(length_px: float) -> None:
+    """Upright bars have more detail across than along, which passes for noise under a short blur path.
+
+    The coding step bounds the noise and never raises it.
+    """
     field, step = _field(length_px, np.pi / 2), 12.0
     bars = np.random.default_rng(3).normal(0, 25, WIDTH)
     sharp = 127 + 60 * (texture(HEIGHT, WIDTH, seed=5) - 0.5) + cv2.GaussianBlur(bars[None], (0, 0), 0.7)
@@ -70,10 +76,10 @@ def test_a_coders_noise_is_bounded_by_its_step(length_px: float) -> None:
     assert np.all(known.noise <= unknown.noise * 1.001)
 
 
-def test_colours_cannot_hold_more_noise_than_their_coder_leaves() -> None:
-    """Colours coded in steps of 12, one sample a square of two pixels; a step of ½ leaves next to no noise.
+def test_chroma_has_no_more_noise_than_coding_leaves() -> None:
+    """Chroma is coded in steps of 12 with one sample per 2 × 2 pixels; a step of 1/2 more than halves the noise.
 
-    Uncertain kernels lift the bound of the luma alone.
+    An uncertain kernel lifts the bound for luma only.
     """
     field = _field(9.0, np.pi / 2)
     sharp = 80 * (texture(HEIGHT // 2, WIDTH // 2, seed=6) - 0.5)
@@ -95,14 +101,14 @@ def test_colours_cannot_hold_more_noise_than_their_coder_leaves() -> None:
 @pytest.mark.parametrize("noise_levels", [1.5, 4.0, 8.0])
 @pytest.mark.parametrize("angle_rad", [0.4, 1.9])
 def test_white_noise_is_measured(noise_levels: float, angle_rad: float) -> None:
-    """A known white noise comes back within 15 per cent, under a known blur."""
+    """Known white noise is measured within 15 % under a known blur."""
     field = _field(angle_rad=angle_rad)
     luma, _ = measure_picture(_blurred(field, noise_levels)[0], field, STRAIGHT)
     assert luma.noise_levels == pytest.approx(noise_levels, rel=0.15)
 
 
 def test_noise_to_signal_is_of_the_right_order() -> None:
-    """Ring by ring, N / S is within a factor of 2.5 of what was put in where the two compete, and rises."""
+    """N / S of each ring is within a factor of 2.5 of the truth where noise and signal are comparable, and rises."""
     field = _field()
     picture, sharp = _blurred(field, 4.0)
     luma, _ = measure_picture(picture, field, STRAIGHT)
@@ -118,24 +124,24 @@ def test_noise_to_signal_is_of_the_right_order() -> None:
 
 
 @pytest.mark.parametrize("length_px", [3.0, 15.0])
-def test_what_the_blur_took_is_measured(length_px: float) -> None:
-    """The mean square of what the blur changed, noise aside, comes back from the blurred picture alone."""
+def test_the_loss_by_blur_is_measured(length_px: float) -> None:
+    """The mean square of the change by blur, without noise, follows from the blurred picture alone."""
     field = _field(length_px)
     picture, sharp = _blurred(field, 2.0)
     lost = np.mean((sharp - cv2.filter2D(sharp, -1, field.arrays()[0].astype(float))) ** 2)
     assert measure_picture(picture, field, STRAIGHT)[0].blur_error == pytest.approx(lost, rel=0.12)
 
 
-def test_more_noise_promises_less() -> None:
-    """The expected gain is positive under a clean blur and shrinks as noise grows."""
+def test_more_noise_lowers_the_expected_gain() -> None:
+    """The expected gain is above 1.5 dB with little noise and shrinks as noise grows."""
     field = _field()
     gains = [measure_picture(_blurred(field, n)[0], field, STRAIGHT)[0].expected_gain_db for n in (1.0, 4.0, 12.0)]
     assert gains[0] > gains[1] > gains[2] >= 0
     assert gains[0] > 1.5
 
 
-def test_a_blur_that_the_picture_does_not_show_comes_out_as_noise() -> None:
-    """A sharp picture under a predicted blur is judged as noisier than the same prediction where it is true."""
+def test_a_blur_absent_from_the_picture_counts_as_noise() -> None:
+    """A sharp picture with a predicted blur gets more than twice the noise of a picture with that blur."""
     field = _field()
     picture, sharp = _blurred(field, 1.5)
     unblurred = np.repeat(np.rint(sharp).astype(np.uint8)[..., None], 3, -1)
@@ -143,8 +149,8 @@ def test_a_blur_that_the_picture_does_not_show_comes_out_as_noise() -> None:
     assert missed > 2 * seen
 
 
-def test_a_grey_picture_has_no_colour_noise() -> None:
-    """Chroma has statistics of its own: where there is no colour, little but rounding is left of it."""
+def test_a_grey_picture_has_hardly_any_chroma_signal() -> None:
+    """Chroma has separate statistics: in a grey picture little but rounding remains."""
     field = _field()
     luma, chroma = measure_picture(_blurred(field, 4.0)[0], field, STRAIGHT)
     assert np.all(chroma.signal < 0.05 * luma.signal)
@@ -159,8 +165,8 @@ def test_a_grey_picture_has_no_colour_noise() -> None:
         pytest.param(np.full((HEIGHT, WIDTH, 3), (200, 40, 90), np.uint8), id="one colour"),
     ],
 )
-def test_a_picture_that_says_nothing_gives_finite_numbers(picture: NDArray[np.uint8]) -> None:
-    """Where nothing can be measured all figures are finite and positive."""
+def test_pictures_without_detail_give_finite_statistics(picture: NDArray[np.uint8]) -> None:
+    """All figures are finite, and signal and noise are positive."""
     for statistics in measure_picture(picture, _field(), STRAIGHT):
         for values in (statistics.signal, statistics.noise, statistics.noise_to_signal):
             assert np.isfinite(values).all()
@@ -169,7 +175,7 @@ def test_a_picture_that_says_nothing_gives_finite_numbers(picture: NDArray[np.ui
 
 
 def test_rings_are_spread_over_a_packed_spectrum() -> None:
-    """Ring values stand at their frequencies, and fall to nothing at the mean, which needs no regularisation."""
+    """Ring values are placed at their frequencies; at the mean, which needs no regularisation, the value is 0."""
     frequency = (np.arange(24) + 0.5) / 48
     statistics = PictureStatistics(frequency, np.ones(24), np.ones(24), np.ones(24), 1.0)
     spread = on_spectrum(statistics, 1 + frequency, 96)
@@ -179,7 +185,7 @@ def test_rings_are_spread_over_a_packed_spectrum() -> None:
 
 
 def test_scaled_statistics_are_those_of_the_scaled_picture() -> None:
-    """White noise of a picture 4/3 times smaller is weaker by as much; its rings stand at higher frequencies."""
+    """In a picture reduced to 3/4, white noise falls to 3/4 and the rings are at frequencies 4/3 times higher."""
     frequency = (np.arange(24) + 0.5) / 48
     statistics = PictureStatistics(frequency, 1 + frequency, np.full(24, 4.0), np.ones(24), 2.0)
     small = statistics.scaled(0.75)
@@ -189,15 +195,15 @@ def test_scaled_statistics_are_those_of_the_scaled_picture() -> None:
     np.testing.assert_allclose(on_spectrum(small, ratio, 96), on_spectrum(statistics, ratio, 96, 4 / 3), rtol=1e-6)
 
 
-def test_gradients_of_a_smaller_picture_are_steeper_from_pixel_to_pixel() -> None:
-    """Over f⁻³ power, whose gradients lie at all scales, the unit grows, by less than the pixels do."""
+def test_gradients_per_pixel_grow_in_a_smaller_picture() -> None:
+    """With f⁻³ power, which has gradients at all scales, the gradient scale grows by less than the reduction."""
     frequency = (np.arange(24) + 0.5) / 48
     statistics = PictureStatistics(frequency, frequency**-3.0, np.ones(24), np.ones(24), 1.0)
     assert 1.0 < statistics.scaled(0.5).gradient_scale / statistics.gradient_scale < 2.0
 
 
-def test_the_finest_frequency_is_the_last_that_stands_out_of_the_noise() -> None:
-    """The highest ring whose power, as the blur passes it, is above the noise; the lowest where none is."""
+def test_the_finest_frequency_is_the_last_above_the_noise() -> None:
+    """It is the highest ring whose power after the blur exceeds the noise, or the lowest ring if none does."""
     frequency = (np.arange(24) + 0.5) / 48
     signal = np.where(frequency < 0.3, 8.0, 1.0)
     statistics = PictureStatistics(frequency, signal, np.full(24, 2.0), np.full(24, 0.5), 1.0)
@@ -205,15 +211,15 @@ def test_the_finest_frequency_is_the_last_that_stands_out_of_the_noise() -> None
     assert PictureStatistics(frequency, signal, np.full(24, 9.0), np.ones(24), 3.0).finest == frequency[0]
 
 
-def test_few_tiles_measure_a_plain_noise_too() -> None:
-    """With a third of the tiles a known white noise still comes back within 15 per cent."""
+def test_few_tiles_suffice_for_white_noise() -> None:
+    """With a third of the tiles known white noise is still measured within 15 %."""
     field = _field()
     luma, _ = measure_picture(_blurred(field, 4.0)[0], field, STRAIGHT, None, 4)
     assert luma.noise_levels == pytest.approx(4.0, rel=0.15)
 
 
-def test_lamps_are_no_noise() -> None:
-    """Clipped streaks all over leave the measured noise within 15 per cent; taken for light, they would triple it."""
+def test_clipped_highlights_are_not_noise() -> None:
+    """With the mask of clipped streaks the noise is right within 15 %; without it, it is three times too large."""
     field = _field()
     sharp = 255 * (0.2 + 0.6 * texture(HEIGHT, WIDTH, seed=5))
     rng = np.random.default_rng(9)
@@ -230,7 +236,7 @@ def test_lamps_are_no_noise() -> None:
 
 
 def test_a_picture_clipped_all_over_gives_finite_statistics() -> None:
-    """White from edge to edge: nothing to measure, and no division by nothing."""
+    """A picture that is white everywhere causes no division by zero."""
     white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     luma, chroma = measure_picture(white, _field(), STRAIGHT, np.ones((HEIGHT, WIDTH), np.uint8))
     for found in (luma, chroma):
@@ -238,8 +244,11 @@ def test_a_picture_clipped_all_over_gives_finite_statistics() -> None:
         assert np.isfinite(found.expected_gain_db)
 
 
-def test_detail_that_a_coder_took_away_is_taken_to_fall_as_a_pictures_does() -> None:
-    """Where the noise comes near what passes, the sharp picture keeps at least its last clear ring's fall; no less."""
+def test_detail_removed_by_coding_is_extrapolated() -> None:
+    """Where the noise is close to the recorded power, the sharp picture continues the fall of its last clear ring.
+
+    Clear rings are unchanged.
+    """
     frequency = (np.arange(24) + 0.5) / 48
     signal, noise, passed = 40.0 * frequency**-3, np.full(24, 900.0), np.linspace(0.9, 0.1, 24)
     cut = np.where(frequency > 0.3, 1e-3 * signal, signal)
@@ -249,8 +258,8 @@ def test_detail_that_a_coder_took_away_is_taken_to_fall_as_a_pictures_does() -> 
     np.testing.assert_array_equal(clear, signal)
 
 
-def test_detail_that_a_coder_took_away_makes_no_grating(rng: np.random.Generator) -> None:
-    """Where it lies below the law of natural pictures, rings still fit what was recorded, and no place is looked at."""
+def test_detail_removed_by_coding_is_not_taken_for_a_grating(rng: np.random.Generator) -> None:
+    """Detail below the law of natural pictures leaves no unevenness, since the rings still fit the recorded power."""
     fy, fx = np.fft.fftfreq(SIDE)[:, None], np.arange(1, SIDE // 2)[None, :] / SIDE
     frequency = np.hypot(fx, fy)
     passed = np.stack([np.sinc(3 * (fx * np.cos(a) + fy * np.sin(a))) ** 2 for a in np.linspace(0.4, 0.65, 6)])
@@ -265,7 +274,7 @@ def test_detail_that_a_coder_took_away_makes_no_grating(rng: np.random.Generator
 
 @pytest.mark.parametrize("height", [41, 45])
 def test_white_noise_is_the_median_second_difference(height: int, rng: np.random.Generator) -> None:
-    """What the histogram gives is the median of every fourth pixel's second difference both ways."""
+    """The histogram gives the median of the second difference in both directions at every fourth pixel."""
     plane = rng.integers(0, 256, (height, 58)).astype(np.uint8)
     mask = np.outer([1, -2, 1], [1, -2, 1]).astype(float)
     differences = cv2.filter2D(plane.astype(float), -1, mask)[2 : height - 2 : 4, 2:-2:4]
@@ -274,7 +283,7 @@ def test_white_noise_is_the_median_second_difference(height: int, rng: np.random
 
 
 def _coded(picture: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """Blocks' cosine transforms in whole steps, as a movie's coder stores them."""
+    """Quantise the cosine transforms of blocks, as a video encoder does."""
     coded = picture.copy()
     height, width = picture.shape
     for top in range(0, height - 3, 4):
@@ -284,8 +293,8 @@ def _coded(picture: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     return coded
 
 
-def test_a_coders_noise_is_level_where_the_picture_stands_out_of_it() -> None:
-    """A short blur tells the noise at high frequencies only, where it falls with the picture; below it is level."""
+def test_coding_noise_is_level_where_the_picture_exceeds_it() -> None:
+    """A short blur shows noise at high frequencies only, where it falls with the picture; at lower ones it is level."""
     field = _field(3.0)
     blurred = cv2.filter2D(255 * (0.2 + 0.6 * texture(HEIGHT, WIDTH, seed=5)), -1, field.arrays()[0].astype(float))
     coded = _coded(blurred, 20.0)
@@ -302,8 +311,8 @@ def test_a_coders_noise_is_level_where_the_picture_stands_out_of_it() -> None:
 
 @pytest.mark.parametrize("turned_deg", [10, 145])
 @pytest.mark.parametrize("length_px", [2.0, 3.5])
-def test_stripes_across_a_short_path_are_no_noise(length_px: float, turned_deg: int) -> None:
-    """A path of a few pixels cancels little: detail that is strongest along it must not pass for noise there."""
+def test_stripes_under_a_short_path_are_not_noise(length_px: float, turned_deg: int) -> None:
+    """A path of a few pixels cancels little, so detail that is strongest along it must not count as noise."""
     field, rng = _field(length_px, angle_rad=0.0), np.random.default_rng(3)
     stripes = cv2.blur(cv2.GaussianBlur(rng.standard_normal((900, 900)), (0, 0), 0.7), (1, 25))
     stripes = cv2.warpAffine(stripes, cv2.getRotationMatrix2D((450, 450), turned_deg, 1.0), (900, 900))
@@ -316,8 +325,8 @@ def test_stripes_across_a_short_path_are_no_noise(length_px: float, turned_deg: 
 
 
 @pytest.mark.parametrize("std_px", [0.1, 0.6, 2.0])
-def test_a_misplaced_picture_gains_what_its_spectrum_says(std_px: float) -> None:
-    """Errors of restored and recorded power, averaged over many shifts, are those that the record foretells."""
+def test_errors_of_a_misplaced_picture_follow_from_its_spectrum(std_px: float) -> None:
+    """Errors of the restored and the recorded picture, averaged over many shifts, equal the predicted ones."""
     frequency = (np.arange(24) + 0.5) / 48
     signal, passed, noise = 100 * (0.02 / frequency) ** 2.5, np.exp(-((6 * frequency) ** 2)), np.full(24, 0.01)
     found = PictureStatistics(frequency, signal, noise, passed, 1.0)
@@ -338,8 +347,8 @@ def test_a_misplaced_picture_gains_what_its_spectrum_says(std_px: float) -> None
     assert misplaced.weight @ misplaced.blurred == pytest.approx(recorded_off - recorded, rel=0.03)
 
 
-def test_no_frame_has_less_than_its_coders_noise() -> None:
-    """Noise that was missed is put in, its level grows with it, and noise that was measured stays."""
+def test_a_frame_has_at_least_the_noise_of_its_coder() -> None:
+    """Missed noise is added and raises the noise level; noise that was measured stays."""
     frequency = (np.arange(24) + 0.5) / 48
     signal, passed = 100 * (0.02 / frequency) ** 2.5, np.exp(-((6 * frequency) ** 2))
     missed, found = (PictureStatistics(frequency, signal, np.full(24, n), passed, np.sqrt(n)) for n in (0.2, 400.0))
@@ -352,8 +361,8 @@ def test_no_frame_has_less_than_its_coders_noise() -> None:
     assert found.with_coder_noise(30.0, 0.5).noise_levels == pytest.approx(found.noise_levels)
 
 
-def test_colour_is_measured_where_it_is() -> None:
-    """Beside grey stripes, which held every other tile, colours have the spectrum that they have alone."""
+def test_chroma_is_measured_where_the_picture_has_colour() -> None:
+    """Grey stripes beside the colours, over part of the tiles, hardly change the spectrum of chroma."""
     field = _field()
     grey, sharp = _blurred(field, 1.0)
     other = cv2.filter2D(255 * (0.3 + 0.4 * texture(HEIGHT, WIDTH, seed=9)), -1, field.arrays()[0].astype(float))

@@ -1,4 +1,4 @@
-"""The one warp: identity where nothing moved, exact corners, and a rectangle that holds real data only."""
+"""The single warp: identity without motion, exact corners, and a valid rectangle that contains only recorded data."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def _identity(height: int, width: int) -> NDArray[np.float32]:
     return np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float32)
 
 
-def test_warping_to_its_own_place_changes_nothing(rng: np.random.Generator) -> None:
-    """The identity map returns the picture, to the last grey level."""
+def test_the_identity_map_changes_nothing(rng: np.random.Generator) -> None:
+    """The identity map returns the same picture, to the last grey level."""
     picture = rng.integers(0, 256, (37, 53, 3), dtype=np.uint8)
     np.testing.assert_array_equal(warp(picture, _identity(37, 53)), picture)
 
 
 def test_a_warp_reads_at_its_source_and_repeats_the_edge(rng: np.random.Generator) -> None:
-    """A map of (x + 2, y − 3) shows what lay there; outside, the nearest edge pixel."""
+    """A map of (x + 2, y − 3) reads the source there; outside the picture it repeats the nearest edge pixel."""
     picture = rng.integers(0, 256, (37, 53, 3), dtype=np.uint8)
     shown = warp(picture, _identity(37, 53) + np.float32([2, -3]))
     np.testing.assert_array_equal(shown[3:, :-2], picture[:-3, 2:])
@@ -33,8 +33,8 @@ def test_a_warp_reads_at_its_source_and_repeats_the_edge(rng: np.random.Generato
 
 @pytest.mark.parametrize("direction", ["bottom_to_top", "left_to_right"])
 @pytest.mark.parametrize("anchor", [0.0, 0.5])
-def test_rowwise_maps_name_where_each_pixel_was_recorded(direction: str, anchor: float) -> None:
-    """The map at a pixel of the straightened picture is the recorded point, to a hundredth of a pixel."""
+def test_rowwise_maps_give_the_place_of_recording(direction: str, anchor: float) -> None:
+    """The map at a straightened pixel is the recorded point, within 0.02 px."""
     motion = TurningCamera(phone(lens=RADTAN, readout_direction=direction)).motion
     source = rowwise_map(motion, anchor)
     points = np.array([[0, 0], [199, 135], [20, 97], [150, 40]])
@@ -43,8 +43,8 @@ def test_rowwise_maps_name_where_each_pixel_was_recorded(direction: str, anchor:
 
 
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-def test_perspective_maps_take_the_corners_home(direction: str) -> None:
-    """Where a recorded corner belongs, the homography reads that corner (to what interpolating a map allows)."""
+def test_perspective_maps_are_exact_at_the_corners(direction: str) -> None:
+    """At the straightened place of a recorded corner the homography reads that corner, within 0.02 px."""
     turning = camera((0.9, -1.2, 0.6), 0.02, direction, reference="frame-middle")
     motion = turning.motion
     corners = corner_points(336, 240)
@@ -57,8 +57,8 @@ def test_perspective_maps_take_the_corners_home(direction: str) -> None:
         np.testing.assert_allclose(read, corner, atol=0.02)
 
 
-def test_both_methods_agree_where_rows_share_one_time() -> None:
-    """Without a readout one homography is the whole truth."""
+def test_both_methods_agree_without_readout() -> None:
+    """If all rows share one time, the rowwise map is a homography."""
     motion = camera((0.9, -2.0, 1.6)).motion
     np.testing.assert_allclose(perspective_map(motion, 0.5), rowwise_map(motion, 0.5), atol=0.02)
 
@@ -70,7 +70,7 @@ def _missing(source: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _largest_area(good: NDArray[np.bool_]) -> int:
-    """Area of the largest rectangle of True, by trying every pair of rows with the widest run between them."""
+    """Area of the largest rectangle of True values, by trying every pair of rows and the widest run between them."""
     best = 0
     for top in range(len(good)):
         run = np.ones(good.shape[1], bool)
@@ -85,8 +85,8 @@ def _largest_area(good: NDArray[np.bool_]) -> int:
 
 @pytest.mark.parametrize("rate", [(0.9, -2.0, 0.6), (-3.0, 1.0, 4.0), (0.0, 0.0, -8.0), (2.0, 5.0, 0.0)])
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-def test_the_valid_rectangle_is_real_and_near_maximal(rate: tuple[float, float, float], direction: str) -> None:
-    """Every pixel inside was recorded, and no rectangle is much larger."""
+def test_the_valid_rectangle_is_recorded_and_nearly_maximal(rate: tuple[float, float, float], direction: str) -> None:
+    """Every pixel inside was recorded, and the area is at least 0.9 of the largest possible one."""
     profile = phone(120, 88, 150.0, readout_direction=direction)
     source = rowwise_map(TurningCamera(profile, rate).motion, 0.5)
     missing = _missing(source)
@@ -95,8 +95,8 @@ def test_the_valid_rectangle_is_real_and_near_maximal(rate: tuple[float, float, 
     assert (x1 - x0) * (y1 - y0) >= 0.9 * _largest_area(~missing)
 
 
-def test_everything_is_valid_where_nothing_moved() -> None:
-    """The identity leaves the whole picture; a map that looks elsewhere leaves next to nothing, and no crash."""
+def test_everything_is_valid_without_motion() -> None:
+    """The identity keeps the whole picture; a map that reads outside it gives an empty rectangle."""
     assert valid_rectangle(_identity(37, 53)) == (0, 0, 53, 37)
     x0, y0, x1, y1 = valid_rectangle(_identity(37, 53) + 1000)
     assert 0 <= x0 <= x1 <= 53

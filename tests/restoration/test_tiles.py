@@ -1,4 +1,4 @@
-"""Tiles in the Fourier domain: packed spectra against NumPy's, no seams, no shift, and a picture recovered."""
+"""Tiles in the Fourier domain: packed spectra equal NumPy's, with no seams and no shift, and undo a known blur."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _filtered_by_numpy(
 
 
 def _lopsided_kernel(size: int = 15) -> NDArray[np.float32]:
-    """Make a bent stroke that starts off the middle, sums to 1."""
+    """A curved asymmetric stroke that starts off the middle and sums to 1."""
     kernel = np.zeros((size, size), np.float32)
     points = np.array([[4, 5], [7, 6], [10, 8], [12, 11]], np.int32)
     cv2.polylines(kernel, [points[:, None]], False, 1.0)
@@ -52,7 +52,7 @@ def _lopsided_kernel(size: int = 15) -> NDArray[np.float32]:
 
 
 def packed_power(spectrum: Image) -> Image:
-    """|K|² of packed spectra as tiles have it."""
+    """|K|² of packed spectra, computed as for tiles."""
     power = np.empty_like(spectrum)
     _power_inside(spectrum, power)
     _power_at_ends(spectrum, power)
@@ -60,7 +60,7 @@ def packed_power(spectrum: Image) -> Image:
 
 
 def packed_product(first: Image, second: Image) -> Image:
-    """Multiply packed spectra as tiles do, one at a time or in place of the first."""
+    """Multiply packed spectra as for tiles: one at a time, or in place of the first."""
     if first.ndim == 2:
         product = first.copy()
         _product(product, second, product)
@@ -73,7 +73,7 @@ def packed_product(first: Image, second: Image) -> Image:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_packed_powers_are_real_factors(size: int, rng: np.random.Generator) -> None:
-    """A packed |K|² multiplies as the full |K|² does in NumPy's transform, in every place of the packing."""
+    """Multiplying by packed |K|² equals multiplying NumPy's full spectrum by |K|²."""
     kernel = random_picture((size, size), rng) / size
     picture = random_picture((size, size), rng)
     expected = _filtered_by_numpy(picture, lambda fy, fx: np.abs(np.fft.fft2(kernel)) ** 2)
@@ -83,7 +83,7 @@ def test_packed_powers_are_real_factors(size: int, rng: np.random.Generator) -> 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_packed_products_are_periodic_convolutions(size: int, rng: np.random.Generator) -> None:
-    """The product of two packed spectra is that of NumPy's full ones."""
+    """The product of two packed spectra equals the product of NumPy's full spectra."""
     picture, kernel = (random_picture((size, size), rng) / size for _ in range(2))
     expected = np.fft.ifft2(np.fft.fft2(picture) * np.fft.fft2(kernel)).real
     product = cv2.idft(packed_product(cv2.dft(picture), cv2.dft(kernel)), flags=cv2.DFT_SCALE)
@@ -91,8 +91,8 @@ def test_packed_products_are_periodic_convolutions(size: int, rng: np.random.Gen
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_packed_frequency_is_numpys(size: int, rng: np.random.Generator) -> None:
-    """A factor of the packed frequency is the same factor of NumPy's frequencies."""
+def test_packed_frequency_equals_numpys(size: int, rng: np.random.Generator) -> None:
+    """A factor made from the packed frequency equals that factor made from NumPy's frequencies."""
     picture = random_picture((size, size), rng)
     expected = _filtered_by_numpy(picture, lambda fy, fx: np.hypot(fx, fy) ** 2 + 0.3)
     np.testing.assert_allclose(_filtered(picture, packed_frequency(size) ** 2 + 0.3), expected, atol=1e-5)
@@ -108,7 +108,7 @@ def test_gradient_power_is_that_of_forward_differences(size: int, rng: np.random
 
 @pytest.mark.parametrize(("height", "width", "side"), [(137, 211, 64), (41, 29, 64), (96, 200, 96)])
 def test_a_constant_picture_stays_constant(height: int, width: int, side: int) -> None:
-    """No seams between tiles and no dark borders: a flat picture stays flat to a thousandth, edges included."""
+    """No seams between tiles and no dark borders: a flat picture stays flat within 0.1 %, edges included."""
     grid = tile_grid(height, width, side, side // 4)
     deconvolution = TileDeconvolution(grid, np.repeat(_lopsided_kernel()[None], len(grid.centres_px), 0), 16)
     flat = np.full((height, width), 0.4, np.float32)
@@ -121,8 +121,8 @@ def test_a_constant_picture_stays_constant(height: int, width: int, side: int) -
 
 
 @pytest.mark.parametrize("side", [64, 128])
-def test_a_known_lopsided_blur_is_undone(side: int) -> None:
-    """A picture blurred by a bent, off-centre stroke comes back sharp and in its place."""
+def test_a_known_asymmetric_blur_is_undone(side: int) -> None:
+    """A picture blurred by a curved, off-centre stroke becomes sharp, without a shift."""
     sharp = (255 * texture(199 + 40, 262 + 40)).astype(np.float32)
     kernel = _lopsided_kernel()
     blurred = cv2.filter2D(sharp, cv2.CV_32F, kernel)[20:-20, 20:-20]
@@ -140,7 +140,7 @@ def test_a_known_lopsided_blur_is_undone(side: int) -> None:
 
 
 def test_each_tile_is_restored_by_its_own_kernel() -> None:
-    """With kernels that shift left tiles up and right tiles down, back projection shifts them back."""
+    """Kernels shift left tiles up and right tiles down; back projection shifts each of them back."""
     sharp = texture(64, 300).astype(np.float32)
     grid = tile_grid(64, 300, 64, 16)
     kernels = np.zeros((len(grid.centres_px), 9, 9), np.float32)
@@ -153,14 +153,14 @@ def test_each_tile_is_restored_by_its_own_kernel() -> None:
     np.testing.assert_allclose(restored[10:50, 250:], sharp[7:47, 250:], atol=1e-4)
 
 
-def test_the_inverse_is_held_where_nothing_passes() -> None:
-    """The naive inverse stays finite where the kernel cancels, and is exact where it passes."""
+def test_the_naive_inverse_is_bounded() -> None:
+    """It stays finite where the kernel cancels, and is exact where it passes."""
     np.testing.assert_allclose(inverse_filter(np.array([0.0, 1e-6, 0.25], np.float32)), [1000, 1000, 4], rtol=1e-6)
 
 
 @pytest.mark.parametrize("border", [3e-2, 7e-2])
-def test_what_pulls_is_0_beyond_the_picture(border: float) -> None:
-    """A pull goes into each tile at its place, times the factor of tiles inside or at the picture's border."""
+def test_the_pull_is_zero_outside_the_picture(border: float) -> None:
+    """Each tile receives the pull at its place, times the factor for tiles inside or at the picture's border."""
     pull = texture(150, 210).astype(np.float32)
     grid = tile_grid(150, 210, 64, 16)
     deconvolution = TileDeconvolution(grid, np.repeat(_lopsided_kernel()[None], len(grid.centres_px), 0), 16)
@@ -176,8 +176,8 @@ def test_what_pulls_is_0_beyond_the_picture(border: float) -> None:
 
 
 @pytest.mark.parametrize(("height", "width", "margin"), [(480, 640, 16), (1280, 720, 23), (360, 640, 8), (90, 70, 41)])
-def test_quick_tiles_cover_the_picture_and_fill_their_transforms(height: int, width: int, margin: int) -> None:
-    """The grid reaches every pixel, with tiles near the side asked for and windows that sum to one."""
+def test_quick_tiles_cover_the_picture(height: int, width: int, margin: int) -> None:
+    """The grid reaches every pixel, tiles have about the requested side, and the windows sum to 1."""
     grid = quick_grid(height, width, 120, 3 * margin, 5)
     total = np.zeros((grid.tops[-1] + grid.side, grid.lefts[-1] + grid.side))
     for (top, left), window in zip(grid.corners(), grid.windows(), strict=True):
@@ -187,8 +187,8 @@ def test_quick_tiles_cover_the_picture_and_fill_their_transforms(height: int, wi
 
 
 @pytest.mark.parametrize(("height", "width"), [(853, 480), (480, 853), (640, 360)])
-def test_overlaps_that_give_a_little_spare_tiles(height: int, width: int) -> None:
-    """Tiles still cover the picture and overlap by nearly what was asked for, and there are never more of them."""
+def test_a_flexible_overlap_saves_tiles(height: int, width: int) -> None:
+    """Tiles still cover the picture, overlap by almost the requested amount, and cost no more than 5 % extra pixels."""
     strict, loose = (quick_grid(height, width, 117, 18, 3, give) for give in (0.0, 0.1))
     pixels = [len(g.tops) * len(g.lefts) * fast_size(g.side + 18) ** 2 for g in (strict, loose)]
     assert pixels[1] <= 1.05 * pixels[0]
@@ -198,7 +198,7 @@ def test_overlaps_that_give_a_little_spare_tiles(height: int, width: int) -> Non
 
 
 def test_stacked_spectra_are_multiplied_one_by_one(rng: np.random.Generator) -> None:
-    """Products and powers of several packed spectra at once are those of each, the columns at the ends included."""
+    """Products and powers of stacked packed spectra equal those of each spectrum, including the end columns."""
     first, second = (np.stack([cv2.dft(random_picture((16, 16), rng)) for _ in range(3)]) for _ in range(2))
     for stacked, single in (
         (packed_product(first, second), [packed_product(a, b) for a, b in zip(first, second, strict=True)]),
@@ -208,7 +208,7 @@ def test_stacked_spectra_are_multiplied_one_by_one(rng: np.random.Generator) -> 
 
 
 def test_a_bridge_may_be_longer_than_the_margins() -> None:
-    """Thin margins and a long bridge make one period together, and tiles that look alike share a window."""
+    """Thin margins with a long bridge share one period; tiles of the same kind share a window."""
     grid = tile_grid(300, 260, 80, 20)
     deconvolution = TileDeconvolution(grid, np.repeat(_lopsided_kernel()[None], len(grid.centres_px), 0), 16, 40)
     assert deconvolution.patch == 80 + 2 * 16
@@ -217,7 +217,7 @@ def test_a_bridge_may_be_longer_than_the_margins() -> None:
 
 
 def _lamp_behind_a_blur() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Make a lamp of twelve times full light in a dim scene, as it is, as blurred by a stroke, and its kernel."""
+    """A lamp of 12 times full light in a dim scene: the sharp scene, the scene blurred by a stroke, and the kernel."""
     sharp = (0.1 + 0.2 * texture(150, 210)).astype(np.float32)
     sharp[70:76, 101:109] = 12.0
     kernel = np.zeros((17, 17), np.float32)
@@ -227,7 +227,7 @@ def _lamp_behind_a_blur() -> tuple[NDArray[np.float32], NDArray[np.float32], NDA
 
 
 def _with_lamp_tamed(recorded: NDArray[np.float32], kernel: NDArray[np.float32]) -> tuple[TileDeconvolution, list[int]]:
-    """Tiles of a picture clipped at 1, those that see clipped light tamed, and their numbers."""
+    """Tiles of a picture clipped at 1 after removing the clipped highlights, and numbers of the touched tiles."""
     grid = tile_grid(*recorded.shape, 64, 16)
     deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], len(grid.centres_px), 0), 16)
     holes = (recorded >= 1).astype(np.float32)
@@ -244,8 +244,8 @@ def _filtered_with_lamps(deconvolution: TileDeconvolution, recorded: NDArray[np.
     )
 
 
-def test_a_tamed_tile_knows_a_clipped_lamp_from_its_streak() -> None:
-    """Where the streak was clipped, the lamp comes back and the dark beside it; other tiles are filtered as before."""
+def test_a_lamp_is_recovered_from_its_clipped_streak() -> None:
+    """Inside the clipped streak, the lamp and the dark beside it are recovered; other tiles are filtered as usual."""
     sharp, blurred, kernel = _lamp_behind_a_blur()
     recorded = np.minimum(blurred, 1)
     deconvolution, numbers = _with_lamp_tamed(recorded, kernel)
@@ -254,13 +254,13 @@ def test_a_tamed_tile_knows_a_clipped_lamp_from_its_streak() -> None:
     near = np.s_[55:91, 85:125]
     before, after = (np.abs(np.minimum(p, 1) - np.minimum(sharp, 1))[near].mean() for p in (recorded, restored))
     assert after < 0.5 * before
-    assert restored.min() > -0.05, "no dark ring beside the lamp"
+    assert restored.min() > -0.05, "a dark ring appears beside the lamp"
     far = np.s_[20:130, 10:40]
     assert np.abs(restored - sharp)[far].mean() < np.abs(recorded - sharp)[far].mean()
 
 
-def test_a_lamp_leaves_the_rest_of_its_tiles_to_the_filter() -> None:
-    """Beyond the lamp's streak a tamed tile is as sharp as the filter makes it in the scene without a lamp."""
+def test_a_lamp_does_not_affect_the_rest_of_its_tiles() -> None:
+    """Outside the lamp's streak a tile is as sharp as in the scene without a lamp."""
     sharp, blurred, kernel = _lamp_behind_a_blur()
     dim = np.minimum(sharp, 0.3)
     without = cv2.filter2D(dim, cv2.CV_32F, kernel)
@@ -277,8 +277,8 @@ def test_a_lamp_leaves_the_rest_of_its_tiles_to_the_filter() -> None:
     assert with_lamp < 1.05 * without_lamp < before
 
 
-def test_tiles_that_see_no_hole_are_not_touched() -> None:
-    """A hole touches the tiles whose margins reach it, and an empty mask none."""
+def test_only_tiles_near_a_hole_are_touched() -> None:
+    """A hole touches the tiles whose margins reach it; an empty mask touches none."""
     grid = tile_grid(100, 300, 64, 16)
     deconvolution = TileDeconvolution(grid, np.repeat(_lopsided_kernel()[None], len(grid.centres_px), 0), 16)
     holes = np.zeros((100, 300), np.float32)
@@ -306,7 +306,7 @@ def _joined(
     weight: float = 1.0,
     variance: float | None = None,
 ) -> TileDeconvolution:
-    """Tiles of a picture to which a further one was joined; trust: None: everywhere."""
+    """Tiles of a picture joined with a further one; a trust of None means trust everywhere."""
     grid = tile_grid(*picture.shape, 64, 16)
     count = len(grid.centres_px)
     deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], count, 0), 16)
@@ -320,14 +320,14 @@ def _joined(
 
 
 def _blurred_by(sharp: Image, kernels: Sequence[Image], seed: int) -> list[Image]:
-    """A picture blurred by each kernel, with noise of its own."""
+    """The picture blurred by each kernel, with independent noise."""
     rng = np.random.default_rng(seed)
     noise = (rng.normal(0, 0.01, sharp.shape).astype(np.float32) for _ in kernels)
     return [cv2.filter2D(sharp, cv2.CV_32F, kernel) + one for kernel, one in zip(kernels, noise, strict=True)]
 
 
-def test_a_picture_joined_with_itself_says_nothing_new() -> None:
-    """A coder that repeats a still frame repeats its noise: twice the same measurement weighs as much as once."""
+def test_joining_a_picture_with_itself_adds_nothing() -> None:
+    """A coder that repeats a still frame repeats its noise, so two equal measurements weigh as much as one."""
     picture, kernel = texture(100, 150).astype(np.float32), _lopsided_kernel()
     twice = _joined(picture, kernel, picture, kernel)
     once = TileDeconvolution(twice.grid, np.repeat(kernel[None], len(twice.grid.centres_px), 0), 16)
@@ -336,8 +336,8 @@ def test_a_picture_joined_with_itself_says_nothing_new() -> None:
     np.testing.assert_allclose(twice.back_projected(picture), projected, atol=1e-5 * np.abs(projected).max())
 
 
-def test_a_picture_coded_with_finer_steps_counts_for_more() -> None:
-    """Of two pictures blurred alike the data term is their mean by the weight of the other."""
+def test_a_picture_with_finer_coding_steps_weighs_more() -> None:
+    """For two equally blurred pictures the data term is their mean, weighted by the other picture's weight."""
     kernel, (first, second) = _lopsided_kernel(), (texture(100, 150).astype(np.float32) * gain for gain in (1.0, 1.2))
     joined = _joined(first, kernel, second, kernel, weight=3.0)
     once = TileDeconvolution(joined.grid, np.repeat(kernel[None], len(joined.grid.centres_px), 0), 16)
@@ -346,8 +346,8 @@ def test_a_picture_coded_with_finer_steps_counts_for_more() -> None:
     np.testing.assert_allclose(joined.back_projected(first), projected, atol=1e-5 * np.abs(projected).max())
 
 
-def test_a_picture_blurred_along_another_path_tells_what_the_first_lost() -> None:
-    """Strokes across and down pass each other's lost frequencies; together they are sharper than either alone."""
+def test_another_blur_path_restores_lost_frequencies() -> None:
+    """A horizontal and a vertical stroke each pass the frequencies the other cancels; together the error halves."""
     sharp = texture(140, 200).astype(np.float32)
     across, down = _stroke(True), _stroke(False)
     first, second = _blurred_by(sharp, (across, down), seed=3)
@@ -366,8 +366,8 @@ def test_a_picture_blurred_along_another_path_tells_what_the_first_lost() -> Non
     assert together < 0.5 * alone
 
 
-def test_a_neighbour_whose_place_is_uncertain_weighs_less() -> None:
-    """What is left of it on average, s, makes (1 - s^2) |K|^2 of the signal an error of its own."""
+def test_a_neighbour_with_an_uncertain_place_weighs_less() -> None:
+    """If the share s of the signal survives averaging, (1 − s²) |K|² of it is an error of the neighbour."""
     picture, across, down = texture(100, 150).astype(np.float32), _stroke(True), _stroke(False)
     known, uncertain = (_joined(picture, across, picture, down, sharpness).powers for sharpness in (1.0, 0.5))
     alone = TileDeconvolution(tile_grid(100, 150, 64, 16), np.repeat(across[None], len(known), 0), 16).powers
@@ -375,8 +375,8 @@ def test_a_neighbour_whose_place_is_uncertain_weighs_less() -> None:
     assert 0 < gain_uncertain < 0.2 * gain_known
 
 
-def test_a_neighbour_whose_kernel_is_uncertain_weighs_less() -> None:
-    """Its kernel's variance makes an error of as much of the signal; most of its weight goes, and none of its power."""
+def test_a_neighbour_with_an_uncertain_kernel_weighs_less() -> None:
+    """The kernel's variance makes an error that takes most of the weight."""
     picture, across, down = texture(100, 150).astype(np.float32), _stroke(True), _stroke(False)
     known, uncertain = (_joined(picture, across, picture, down, variance=v).powers for v in (None, 0.1))
     alone = TileDeconvolution(tile_grid(100, 150, 64, 16), np.repeat(across[None], len(known), 0), 16).powers
@@ -384,8 +384,8 @@ def test_a_neighbour_whose_kernel_is_uncertain_weighs_less() -> None:
     assert 0 < gain_uncertain < 0.2 * gain_known
 
 
-def test_a_picture_that_shows_something_else_in_a_place_changes_nothing_there() -> None:
-    """Where it is left out its content does not matter, and the rest of the tile still gains by it."""
+def test_untrusted_places_of_a_neighbour_change_nothing() -> None:
+    """Where trust is 0 the neighbour's content has no effect; the same content with trust would change the result."""
     sharp = texture(140, 200).astype(np.float32)
     across, down = _stroke(True), _stroke(False)
     first, second = _blurred_by(sharp, (across, down), seed=4)

@@ -1,4 +1,4 @@
-"""Clocks that nothing tells: frames are not restored as if they agreed."""
+"""Clocks without a determined offset: frames are not restored as if the clocks agreed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STILL = Setup(seed=3, frames=6, width=96, height=128, focal_px=100.0)
 
 
 def still_capture() -> Capture:
-    """Six frames: fewer pairs than an agreement needs."""
+    """Six frames, which have fewer pairs than an agreement test needs."""
     recording = recorded(STILL)
     times = zip(recording.stamp_s, recording.exposure_s, strict=True)
     frames = tuple(Frame(k, k, float(t), float(e)) for k, (t, e) in enumerate(times))
@@ -24,13 +24,13 @@ def still_capture() -> Capture:
 
 
 def gray(numbers):
-    """The same picture again and again."""
+    """The same picture for every frame."""
     picture = np.random.default_rng(1).integers(0, 256, (128, 96)).astype(np.uint8)
     return ((number, picture) for number in numbers)
 
 
-def test_an_undetermined_offset_restores_nothing() -> None:
-    """It is not 0: frames are copied, and the log names the command that finds it."""
+def test_without_a_time_offset_frames_are_copied() -> None:
+    """An undetermined offset is not 0: frames are copied, and the log names the calibration command."""
     unknown = replace(recorded(STILL).profile, time_offset_s=None)
     plan = plan_restoration(still_capture(), unknown, RestorationSettings(), gray)
     assert plan.copy_reason is not None
@@ -38,8 +38,8 @@ def test_an_undetermined_offset_restores_nothing() -> None:
     assert any("time offset not determined" in warning for warning in plan.warnings)
 
 
-def test_a_stated_offset_that_too_few_pairs_can_test_is_used_and_the_log_says_so() -> None:
-    """Fewer than eight pairs are no agreement."""
+def test_an_untestable_offset_is_used_with_a_warning() -> None:
+    """With fewer than eight pairs the offset cannot be checked."""
     plan = plan_restoration(still_capture(), recorded(STILL).profile, RestorationSettings(), gray)
     assert plan.copy_reason is None
     assert any(warning.startswith(UNCHECKED) for warning in plan.warnings)

@@ -1,4 +1,4 @@
-"""The distortion undone in the one warp: as OpenCV has it, with rows at their own times, and where a lens folds."""
+"""Undistortion in the single warp: equal to OpenCV's, with rows at their own times, and refused for folding lenses."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def _by_opencv(lens: Intrinsics) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("model", [RADTAN, PINCUSHION, FISHEYE, WIDE])
-def test_a_picture_that_nothing_else_moves_is_read_as_by_opencv(model: tuple[str, tuple[float, ...]]) -> None:
-    """The pinhole keeps focal lengths and principal point; OpenCV's own map is the same."""
+def test_undistortion_alone_equals_opencvs(model: tuple[str, tuple[float, ...]]) -> None:
+    """The pinhole keeps focal lengths and principal point, and the map equals OpenCV's."""
     lens = _lens(model)
     require_undistortable(lens)
     source = undistortion_map(lens)
@@ -50,8 +50,8 @@ def test_a_picture_that_nothing_else_moves_is_read_as_by_opencv(model: tuple[str
 
 @pytest.mark.parametrize("model", [RADTAN, PINCUSHION, WIDE])
 @pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
-def test_one_warp_reads_what_both_steps_move(model: tuple[str, tuple[float, ...]], direction: str) -> None:
-    """The map is OpenCV's place in the straightened picture, recorded by its row, to a fiftieth of a pixel."""
+def test_one_warp_combines_undistortion_and_straightening(model: tuple[str, tuple[float, ...]], direction: str) -> None:
+    """The map is where a row recorded OpenCV's point of the straightened picture, within 0.02 px."""
     motion = TurningCamera(phone(lens=model, readout_direction=direction)).motion
     assert motion.profile.intrinsics is not None
     shown = _by_opencv(motion.profile.intrinsics).astype(float)[::9, ::7]
@@ -62,8 +62,8 @@ def test_one_warp_reads_what_both_steps_move(model: tuple[str, tuple[float, ...]
     assert np.abs(rowwise_map(motion, 0.5)[::9, ::7] - exact).max() > 1.0
 
 
-def test_the_papers_warp_takes_the_lens_along() -> None:
-    """Corners that were recorded are read where the pinhole shows their straightened places."""
+def test_the_perspective_warp_includes_the_lens() -> None:
+    """At the pinhole image of a straightened corner the map reads the recorded corner."""
     motion = TurningCamera(phone(lens=PINCUSHION), (0.2, -0.3, 0.1)).motion
     lens = motion.profile.intrinsics
     assert lens is not None
@@ -78,8 +78,8 @@ def test_the_papers_warp_takes_the_lens_along() -> None:
         np.testing.assert_allclose(read, corner, atol=0.02)
 
 
-def test_stabiliser_and_drift_stay() -> None:
-    """Lens and pinhole share the stabiliser's shift and the focal length of the instant, so the map follows both."""
+def test_stabiliser_and_focal_drift_remain() -> None:
+    """Lens and pinhole share the stabiliser's shift and the focal length at that time, so the map follows both."""
     profile = phone(lens=RADTAN, readout_time_s=0.0)
     moved = replace(
         profile,
@@ -105,6 +105,6 @@ def test_stabiliser_and_drift_stay() -> None:
     ],
 )
 def test_a_lens_that_folds_inside_the_picture_is_refused(model: tuple[str, tuple[float, ...]], focal_px: float) -> None:
-    """Where the polynomial turns back, one recorded pixel would be shown at two places."""
+    """Where the distortion polynomial turns back, one recorded pixel would appear at two places."""
     with pytest.raises(SettingsError, match="different rays at one place"):
         require_undistortable(_lens(model, focal_px))

@@ -1,4 +1,4 @@
-"""Folders that the scenarios of one session share."""
+"""Folders shared by the scenarios of one session."""
 
 from pathlib import Path
 
@@ -14,6 +14,6 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def hand_held(virest, work: Path) -> Path:
-    """Simulate a hand-held phone held upright: four small frames with some ten pixels of blur."""
+    """Simulate a phone held upright by hand: four small frames with about ten pixels of blur."""
     options = "--width 360 --height 480 --frames 4 --exposure-ms 14 --rate 2 --noise 2 --seed 5"
     return simulate(virest, work / "hand_held", *options.split())

@@ -1,4 +1,4 @@
-"""Simulate and process as a user does, and read what was written."""
+"""Simulate and process as a user would, and read the results."""
 
 import json
 from collections.abc import Callable
@@ -18,7 +18,7 @@ Picture = np.ndarray[Any, np.dtype[np.uint8]]
 
 @dataclass(frozen=True)
 class Result:
-    """What one ``virest process`` left behind."""
+    """The output of one ``virest process``."""
 
     folder: Path
     lines: list[dict[str, Any]]
@@ -26,7 +26,7 @@ class Result:
     stderr: str
 
     def picture(self, line: dict[str, Any]) -> Picture:
-        """Read the picture of a line, RGB."""
+        """Read the RGB picture of a line."""
         return read_png(self.folder / line["output"])
 
 
@@ -45,7 +45,7 @@ def simulate(virest: Virest, folder: Path, *arguments: object) -> Path:
 
 
 def process(virest: Virest, capture: Path, out: Path, *arguments: object) -> Result:
-    """Run ``virest process``; it has to end with 0."""
+    """Run ``virest process``, which must end with exit code 0."""
     done = virest("process", capture, "--out", out, "--jobs", 1, *arguments, timeout=1800)
     assert done.returncode == 0, done.stderr
     folder = out / capture.name
@@ -54,11 +54,11 @@ def process(virest: Virest, capture: Path, out: Path, *arguments: object) -> Res
 
 
 def truth_picture(capture: Path, frame: int, folder: str = "frames") -> Picture:
-    """Read the sharp picture that a global shutter would have taken."""
+    """Read the sharp picture of a global shutter."""
     return read_png(capture / "truth" / folder / f"{frame:06d}.png")
 
 
 def psnrs_db(result: Result, base: Result, capture: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """PSNR of each frame against truth, where ``base`` has real data."""
+    """PSNR of each frame against truth, inside the valid rectangle of ``base``."""
     pairs = zip(result.lines, base.lines, strict=True)
     return np.array([psnr_db(result.picture(a), truth_picture(capture, a["frame"]), b["valid_px"]) for a, b in pairs])

@@ -1,4 +1,4 @@
-"""Calibration from starts that are far off, and from captures that determine nothing: never confident and wrong."""
+"""Calibration from wrong initial values, and from captures that determine nothing: never confident and wrong."""
 
 import json
 import shutil
@@ -26,7 +26,7 @@ LARGEST = {"time_offset_s": 1e-3, "readout_time_s": 1e-3, "rotation_rad": 4e-3, 
 
 
 def capture_with(folder: Path, **options: Any) -> Path:
-    """Simulate a phone held upright with everything basic hidden."""
+    """Simulate a phone held upright with all basic parameters hidden."""
     hidden = [
         f"time_offset={OFFSET_S}",
         f"readout_time={READOUT_S}",
@@ -40,18 +40,18 @@ def capture_with(folder: Path, **options: Any) -> Path:
 
 @pytest.fixture(scope="session")
 def turned(work: Path) -> Path:
-    """A phone that is turned by hand in front of a far scene."""
+    """A phone turned by hand in front of a distant scene."""
     return capture_with(work / "turned", seed=61)
 
 
 @pytest.fixture(scope="session")
 def walked(work: Path) -> Path:
-    """A phone that is turned and moved before a wall that it sees at an angle, 1.5 m away."""
+    """A phone turned and moved in front of a slanted wall 1.5 m away."""
     return capture_with(work / "walked", seed=62, depth_m=1.5, sway_m=0.08, tilt_deg=(14.0, -21.0))
 
 
 def calibrate(virest: Any, capture: Path, folder: Path, *arguments: object) -> dict[str, Any]:
-    """Run ``virest calibrate --json``; it has to end with 0."""
+    """Run ``virest calibrate --json``, which must end with exit code 0."""
     folder.mkdir(exist_ok=True)
     out = folder / "calibrated.yaml"
     done = virest("calibrate", capture, "--json", "--out", out, *arguments, timeout=1800)
@@ -62,13 +62,13 @@ def calibrate(virest: Any, capture: Path, folder: Path, *arguments: object) -> d
 
 @pytest.fixture(scope="session")
 def calibrated(virest: Any, turned: Path, work: Path) -> tuple[dict[str, Any], Path]:
-    """What a calibration of ``turned`` by its own profile says, and the profile that it wrote."""
+    """The facts of a calibration of ``turned`` from its own profile, and the profile it wrote."""
     folder = work / "calibrated_turned"
     return calibrate(virest, turned, folder), folder / "calibrated.yaml"
 
 
 def start_from(capture: Path, folder: Path, **changes: Any) -> Path:
-    """Write a profile like the capture's own with ``section__key`` changed, and return it."""
+    """Write the capture's own profile with ``section__key`` changed, and return its path."""
     content = yaml.safe_load((capture / "camera.yaml").read_text())
     for name, value in changes.items():
         section, key = name.split("__")
@@ -83,7 +83,7 @@ def value_of(facts: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def assert_true(facts: dict[str, Any], capture: Path, judged: tuple[str, ...] = tuple(TRUTH)) -> None:
-    """Offset, readout, sense, axes and bias are those that were hidden; ``judged`` also by standard deviation."""
+    """Check offset, readout, direction, axes and bias against the truth; ``judged`` also by their deviations."""
     for name, truth in TRUTH.items():
         found = value_of(facts, name)
         error = np.abs(np.array(found["value"]) - truth)
@@ -96,7 +96,7 @@ def assert_true(facts: dict[str, Any], capture: Path, judged: tuple[str, ...] = 
 
 
 def rotation_error_rad(profile: dict[str, Any], capture: Path) -> float:
-    """Angle between a profile's axes and the true ones."""
+    """Angle between the profile's axes and the true ones."""
     nominal = np.array(yaml.safe_load((capture / "camera.yaml").read_text())["imu"]["T_cam_imu"])[:3, :3]
     truth = cv2.Rodrigues(np.array(ROTATION))[0] @ nominal
     turn = np.array(profile["imu"]["T_cam_imu"])[:3, :3] @ truth.T
@@ -104,7 +104,7 @@ def rotation_error_rad(profile: dict[str, Any], capture: Path) -> float:
 
 
 def assert_refused_or_open(done: Any, folder: Path) -> None:
-    """Either exit 6 with one line and no file, or an answer in which nothing counts as determined."""
+    """Require either exit code 6 with one line and no file, or a result in which nothing is determined."""
     if done.returncode == 0:
         assert not [v["name"] for v in json.loads(done.stdout)["values"] if v["determined"]], done.stdout
         return
@@ -130,26 +130,24 @@ def assert_refused_or_open(done: Any, folder: Path) -> None:
     ],
     ids=["500 ms late", "500 ms early", "nothing known", "other axes", "wrong sense", "wrong axis of the readout"],
 )
-def test_a_start_that_is_far_off_ends_at_the_truth(
-    virest: Any, turned: Path, tmp_path: Path, changes: dict[str, Any]
-) -> None:
-    """Half a second, any axes and any direction of the readout: the hidden values are found all the same."""
+def test_a_start_far_off_leads_to_the_truth(virest: Any, turned: Path, tmp_path: Path, changes: dict[str, Any]) -> None:
+    """The hidden values are found from offsets half a second off, from any axes, and from any readout direction."""
     facts = calibrate(virest, turned, tmp_path / "out", "--config", start_from(turned, tmp_path, **changes))
     assert_true(facts, turned)
 
 
-def test_a_camera_that_also_travels_is_calibrated(virest: Any, walked: Path, tmp_path: Path) -> None:
-    """With a slanted wall 1.5 m away and 8 cm of sway, the accelerometer's path explains the parallax."""
+def test_a_moving_camera_is_calibrated(virest: Any, walked: Path, tmp_path: Path) -> None:
+    """With a slanted wall at 1.5 m and 8 cm of sway, the accelerometer's path explains the parallax."""
     facts = calibrate(virest, walked, tmp_path / "out")
     assert_true(facts, walked, judged=("time_offset_s", "readout_time_s"))
     assert facts["translation"] != "none"
     assert facts["residual_px"] < 1.5 * facts["noise_px"]
 
 
-def test_a_calibrated_profile_is_good_for_processing(
+def test_a_calibrated_profile_can_be_processed(
     virest: Any, turned: Path, calibrated: tuple[dict[str, Any], Path], tmp_path: Path
 ) -> None:
-    """``process --config`` takes what ``calibrate`` wrote, and uses its offset and readout."""
+    """``process --config`` accepts the output of ``calibrate`` and uses its offset and readout."""
     assert calibrated[0]["translation"] == "none"
     arguments = ("--config", calibrated[1], "--deblur", "none", "--frames", "20:22", "--jobs", 1)
     done = virest("process", turned, "--out", tmp_path / "run", "--json", *arguments)
@@ -159,8 +157,8 @@ def test_a_calibrated_profile_is_good_for_processing(
     assert lines[0]["shutter"]["readout_time_s"] == pytest.approx(READOUT_S, abs=1e-3)
 
 
-def test_two_values_that_a_motion_cannot_part_are_named(virest: Any, turned: Path, tmp_path: Path) -> None:
-    """Everything that --with knows at once: each is near the truth, or said not to be determined."""
+def test_values_that_a_motion_cannot_separate_are_named(virest: Any, turned: Path, tmp_path: Path) -> None:
+    """With all parameters of --with at once, each value is close to the truth or is named as not determined."""
     names = "focal,distortion,principal-point,gyro-scale,clock-skew"
     facts = calibrate(virest, turned, tmp_path / "out", "--with", names)
     lens = yaml.safe_load((turned / "camera.yaml").read_text())["intrinsics"]
@@ -176,18 +174,18 @@ def test_two_values_that_a_motion_cannot_part_are_named(virest: Any, turned: Pat
             assert found["value"] == found["start"] or name in TRUTH
 
 
-# ── nothing to be had ────────────────────────────────────────────────────────────────────────────────────────────
+# ── captures that determine nothing ──────────────────────────────────────────────────────────────────────────────
 
 
 def test_a_camera_at_rest_determines_nothing(virest: Any, tmp_path: Path) -> None:
-    """A phone on a tripod: refused."""
+    """A phone on a tripod is refused, or nothing is determined."""
     simulate_command(tmp_path / "still", frames=30, rate_rad_s=0.0, seed=63, **SIZE)
     done = virest("calibrate", tmp_path / "still", "--json", cwd=tmp_path)
     assert_refused_or_open(done, tmp_path)
 
 
 def test_a_scene_without_texture_determines_nothing(virest: Any, turned: Path, tmp_path: Path) -> None:
-    """A grey wall: only the sensor's noise moves."""
+    """In front of a grey wall only the sensor's noise moves."""
     capture = copy(turned, tmp_path / "wall")
     rng = np.random.default_rng(64)
     times_us = stamps_us(capture)
@@ -196,10 +194,10 @@ def test_a_scene_without_texture_determines_nothing(virest: Any, turned: Path, t
     assert_refused_or_open(virest("calibrate", capture, "--json", cwd=tmp_path), tmp_path)
 
 
-def test_the_gyroscope_of_another_recording_is_not_believed(
+def test_the_gyroscope_of_another_recording_is_not_accepted(
     virest: Any, turned: Path, walked: Path, tmp_path: Path
 ) -> None:
-    """Another shake with the times made to fit: refused."""
+    """The inertial data come from another shake, with their times shifted to this capture."""
     capture = copy(turned, tmp_path / "mixed")
     shift_ns = first_stamp_ns(turned) - first_stamp_ns(walked)
     head, *rows = (walked / "gyro_accel.csv").read_text().splitlines()
@@ -208,8 +206,8 @@ def test_the_gyroscope_of_another_recording_is_not_believed(
     assert_refused_or_open(virest("calibrate", capture, "--json", cwd=tmp_path), tmp_path)
 
 
-def test_a_steady_pan_determines_nothing(virest: Any, turned: Path, tmp_path: Path) -> None:
-    """Constant turning about one axis looks the same at every offset: refused."""
+def test_a_constant_pan_determines_nothing(virest: Any, turned: Path, tmp_path: Path) -> None:
+    """A constant rate about one axis looks the same at every offset."""
     rate_rad_s = 0.25
     capture = copy(turned, tmp_path / "pan")
     times_us = stamps_us(capture)
@@ -218,7 +216,7 @@ def test_a_steady_pan_determines_nothing(virest: Any, turned: Path, tmp_path: Pa
     head, *rows = (turned / "gyro_accel.csv").read_text().splitlines()
     rng = np.random.default_rng(65)
     turns = rng.normal(0, 0.0015, (len(rows), 3))
-    # x_cam = diag(1, −1, −1) x_imu: turning to the right is about the phone's −y
+    # x_cam = diag(1, −1, −1) x_imu: a turn to the right is about the phone's −y
     turns[:, 1] -= rate_rad_s
     lines = [
         f"{row.split(',')[0]},{x:.6f},{y:.6f},{z:.6f},0.1,9.8,0.2" for row, (x, y, z) in zip(rows, turns, strict=True)
@@ -230,16 +228,17 @@ def test_a_steady_pan_determines_nothing(virest: Any, turned: Path, tmp_path: Pa
 # ── real phones and cameras ──────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_pictures_that_the_camera_stabilised_are_refused(virest: Any, realdata: Path, tmp_path: Path) -> None:
-    """An action camera with its stabiliser on: exit 6, no file."""
+def test_a_movie_stabilised_in_the_camera_is_refused(virest: Any, realdata: Path, tmp_path: Path) -> None:
+    """The movie comes from an action camera with its stabiliser on."""
     done = virest("calibrate", realdata / "gopro_hero7", "--json", cwd=tmp_path, timeout=1800)
     assert_refused_or_open(done, tmp_path)
 
 
 def test_the_readout_of_a_phone_in_a_car_is_found(virest: Any, realdata: Path, tmp_path: Path) -> None:
-    """31.7 ms where the metadata say 33.3, and minus 5 ms of offset, though the car travels and tells no acceleration.
+    """The readout is 31.7 ms, although the metadata give 33.3 ms, and the offset is −5 ms.
 
-    The truth is measured from the set itself (its README.md): 30.6 to 32.2 ms and −5.4 to −4.6 ms over several models.
+    The car moves without telling accelerations. The set's README.md derives the truth: 30.6 to 32.2 ms and −5.4 to −4.6
+    ms over several models.
     """
     facts = calibrate(virest, realdata / "lhaippp_car", tmp_path)
     readout, offset = value_of(facts, "readout_time_s"), value_of(facts, "time_offset_s")
@@ -250,10 +249,10 @@ def test_the_readout_of_a_phone_in_a_car_is_found(virest: Any, realdata: Path, t
     assert facts["translation"] != "none"
 
 
-def test_clocks_that_drift_apart_are_noticed_unasked(
+def test_clock_drift_is_found_without_a_request(
     virest: Any, calibrated: tuple[dict[str, Any], Path], tmp_path: Path
 ) -> None:
-    """One offset would look well known and be right at one instant only; clocks that keep together stay so."""
+    """With one offset the value would look certain, but hold at one instant only. Clocks without drift get no skew."""
     right = calibrated[0]
     assert not [v for v in right["values"] if v["name"] == "clock_skew"]
     assert not [note for note in right["notes"] if "held fixed" in note]
@@ -269,8 +268,8 @@ def test_clocks_that_drift_apart_are_noticed_unasked(
     assert "the clocks drift apart by +" in facts["notes"][0]
 
 
-def test_a_lens_that_was_held_fixed_and_is_wrong_is_named(virest: Any, tmp_path: Path) -> None:
-    """Neither is fitted unasked: the points tell both, and how far off they are."""
+def test_a_wrong_fixed_lens_is_named(virest: Any, tmp_path: Path) -> None:
+    """Focal length and distortion are not fitted by default; a note names both with the size of the error."""
     hidden, seed = ["focal_length=0.96", "radial_distortion=0.05"], 64
     simulate_command(tmp_path / "lens", frames=48, exposure_ms=7, rate_rad_s=1.2, crf=20, effects=hidden, seed=seed,
                      truth_frames=False, **SIZE)  # fmt: skip
@@ -280,8 +279,8 @@ def test_a_lens_that_was_held_fixed_and_is_wrong_is_named(virest: Any, tmp_path:
     assert off == pytest.approx(-4.0, abs=1.5)
 
 
-def test_half_a_second_and_another_clock_rate_are_found(virest: Any, realdata: Path, tmp_path: Path) -> None:
-    """A hand-shaken phone whose stamps are evenly made up: +0.42 s and +0.45 % of skew, both as measured otherwise."""
+def test_a_large_offset_and_a_clock_skew_are_found(virest: Any, realdata: Path, tmp_path: Path) -> None:
+    """A hand-shaken phone with evenly spaced made-up timestamps has +0.42 s and +0.45 %, as measured independently."""
     facts = calibrate(virest, realdata / "nexus5_162941", tmp_path)
     assert value_of(facts, "time_offset_s")["value"] == pytest.approx(0.42, abs=0.03)
     skew = value_of(facts, "clock_skew")
@@ -290,8 +289,8 @@ def test_half_a_second_and_another_clock_rate_are_found(virest: Any, realdata: P
     assert "fx_px" in facts["not_determined"]
 
 
-def test_a_capture_within_its_start_up_says_so(virest: Any, realdata: Path, tmp_path: Path) -> None:
-    """No frame is as late as its stamp says: exit 6, and the reason is not a lack of texture."""
+def test_a_capture_within_its_start_up_is_refused(virest: Any, realdata: Path, tmp_path: Path) -> None:
+    """No frame was taken at its timestamp; the error says that no frame can be used."""
     done = virest("calibrate", realdata / "honor_v10", "--json", cwd=tmp_path)
     assert_refused_or_open(done, tmp_path)
     assert "no frame can be used" in done.stderr
@@ -306,12 +305,12 @@ def copy(capture: Path, folder: Path) -> Path:
 
 
 def first_stamp_ns(capture: Path) -> int:
-    """Row 0 of frame_timestamps.txt."""
+    """The timestamp in row 0 of frame_timestamps.txt."""
     return int((capture / "frame_timestamps.txt").read_text().splitlines()[1].split(",")[0])
 
 
 def stamps_us(capture: Path) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Presentation times of a capture's movie, whole microseconds."""
+    """Presentation times of a capture's movie, in whole microseconds."""
     return np.rint(probe_movie(capture / "movie.mp4").pts_s * 1e6).astype(np.int64)
 
 
@@ -329,7 +328,7 @@ def write_movie(path: Path, times_us: np.ndarray[Any, Any], pictures: Any) -> No
 
 
 def pan_pictures(time_s: np.ndarray[Any, Any], rate_rad_s: float, focal_px: float) -> Any:
-    """Yield what a pinhole camera with a global shutter sees of a far texture while it turns about y at one rate."""
+    """Yield the views of a distant texture by a global-shutter pinhole camera that turns about y at a constant rate."""
     rng = np.random.default_rng(66)
     panorama = cv2.GaussianBlur(rng.uniform(0, 255, (SIZE["height"] * 2, SIZE["width"] * 6)), (0, 0), 2.5)
     panorama = np.clip(118 + 6 * (panorama - panorama.mean()), 0, 255)

@@ -1,4 +1,4 @@
-"""A profile that is wrong in an ordinary way: what the pictures contradict is said, and not done to them."""
+"""Wrong profiles: contradictions by the pictures are reported, and the pictures are not damaged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OPTIONS = "--width 480 --height 360 --frames 10 --rate 1.5 --exposure-ms 14 --se
 
 
 def said(result: Result, text: str) -> list[str]:
-    """Warnings about the whole capture that hold a text."""
+    """Warnings about the whole capture that contain a text."""
     return [warning for warning in result.account["warnings"] if text in warning]
 
 
@@ -24,8 +24,8 @@ def reasons(result: Result) -> set[str]:
     return {warning for line in result.lines for warning in line["warnings"]}
 
 
-def test_an_exposure_stated_twice_too_long_deblurs_nothing(virest, work: Path):
-    """Deblurring would ring in every frame; rows are still straightened, and the warning says what to run."""
+def test_an_exposure_twice_too_long_disables_deblurring(virest, work: Path):
+    """Deblurring would cause ringing in every frame; rows are still straightened, and the warning names the command."""
     capture = simulate(virest, work / "stated-long", *OPTIONS.split(), 23, "--effect", "exposure_time=0.5")
     result = process(virest, capture, work / "stated-long-run", "--preset", "fast")
     (warning,) = said(result, "blur paths")
@@ -36,8 +36,8 @@ def test_an_exposure_stated_twice_too_long_deblurs_nothing(virest, work: Path):
     assert np.all(psnrs_db(result, result, capture) > psnrs_db(recorded, result, capture))
 
 
-def test_an_offset_stated_wrong_is_replaced_by_that_of_the_points(virest, work: Path):
-    """The frames are restored as with the true profile, and the log says which offset was used, and why."""
+def test_a_wrong_offset_is_replaced_by_the_tracked_points_one(virest, work: Path):
+    """Frames are restored nearly as with the true profile, and the log gives the offset used and the reason."""
     capture = simulate(virest, work / "stated-late", *OPTIONS.split(), 24, "--effect", "time_offset=-0.02")
     true = process(
         virest, capture, work / "true-run", "--preset", "fast", "--config", capture / "truth" / "camera.yaml"
@@ -54,16 +54,16 @@ def test_an_offset_stated_wrong_is_replaced_by_that_of_the_points(virest, work: 
 
 
 @pytest.mark.parametrize(("scene", "seed"), [("text", 25), ("bright", 26), ("photographs", 27)])
-def test_a_right_profile_is_not_contradicted(virest, work: Path, scene: str, seed: int):
-    """Nothing is said of clock or blur, and no frame is left alone for it."""
+def test_a_correct_profile_is_not_contradicted(virest, work: Path, scene: str, seed: int):
+    """No warning concerns clock or blur, and no frame is left alone for such a reason."""
     capture = simulate(virest, work / f"stated-right-{scene}", *OPTIONS.split(), seed, "--scene", scene)
     result = process(virest, capture, work / "stated-right-run", "--preset", "fast")
     assert not said(result, "the pictures")
     assert not any("disagrees with the profile" in reason for reason in reasons(result))
 
 
-def test_axes_of_another_phone_are_named_and_nothing_is_restored_by_them(virest, work: Path):
-    """Whatever travel would make the points fit: the frames rotate as the gyroscope, but about other axes."""
+def test_wrong_axes_are_named_and_frames_are_copied(virest, work: Path):
+    """The frames rotate like the gyroscope, but about other axes, even though translation might fit the points."""
     options = "--width 480 --height 360 --frames 60 --rate 0.8 --exposure-ms 14 --depth-m 0.5 --seed 29"
     capture = simulate(virest, work / "other-axes", *options.split())
     profile = yaml.safe_load((capture / "camera.yaml").read_text())

@@ -1,4 +1,4 @@
-"""What the exposure curve is worth: the right one beats none and wrong ones, and so does knowing what is clipped."""
+"""The effect of the response curve: the right one beats none and wrong ones, and so does the mask of clipping."""
 
 from pathlib import Path
 
@@ -14,8 +14,8 @@ pytestmark = pytest.mark.scenario
 SEEDS, FRAMES = (11,), 3
 
 
-def test_the_right_curve_beats_none_by_far_at_gamma_2_2(work: Path):
-    """0.7 dB and more above taking grey for light, in the mean; above a wrong gamma on every frame."""
+def test_the_right_curve_beats_no_curve_at_gamma_2_2(work: Path):
+    """It gains 0.7 dB over a linear curve on average, and beats a wrong gamma on every frame."""
     rows = {row["told"]: row for row in curve_rows(work, "gamma 2.2", SEEDS, FRAMES)}
     assert rows["none (linear)"]["right_minus_this_db"] >= 0.7
     for told in ("none (linear)", "gamma 1.2", "gamma 1 / 2.2"):
@@ -23,7 +23,7 @@ def test_the_right_curve_beats_none_by_far_at_gamma_2_2(work: Path):
 
 
 def test_the_right_knots_are_better_on_every_frame(work: Path):
-    """A fifth of the pixels in toe and shoulder: above no curve and one with other knots, by 0.2 dB in the mean."""
+    """With a fifth of the pixels in toe and shoulder, the right knots gain 0.2 dB over no curve and other knots."""
     rows = {row["told"]: row for row in curve_rows(work, "toe and shoulder", SEEDS, FRAMES)}
     assert 0.1 < sum(rows["right"]["toe_and_shoulder"]) < 0.3
     for told in ("none (linear)", "other knots", "srgb"):
@@ -31,8 +31,8 @@ def test_the_right_knots_are_better_on_every_frame(work: Path):
         assert rows[told]["least_right_minus_this_db"] > 0.0
 
 
-def test_lamps_do_no_harm_where_they_are_known_to_be_clipped(work: Path):
-    """3 % of the pixels several times too bright: 3 dB and more by the mask, near the lamps, elsewhere 1 dB."""
+def test_the_clipping_mask_makes_lamps_harmless(work: Path):
+    """About 3 % of the pixels are several times too bright. The mask gains 3 dB near the lamps and 1 dB elsewhere."""
     rows = {row["told"]: row for row in clipping_rows(work, "highlights", SEEDS, FRAMES)}
     assert 0.02 < rows["without"]["clipped"] < 0.05
     for part, least_db in (("near_db", 3.0), ("whole_db", 3.0), ("elsewhere_db", 1.0)):
@@ -41,10 +41,10 @@ def test_lamps_do_no_harm_where_they_are_known_to_be_clipped(work: Path):
     assert rows["with the mask"]["elsewhere_db"] > rows["nothing clipped"]["elsewhere_db"] - 1.0
 
 
-def test_overexposed_areas_leave_the_rest_of_the_picture_alone(work: Path):
-    """3 % of the pixels a little too bright: elsewhere within 0.3 dB of the same scene in less light, in the mean.
+def test_overexposed_areas_do_not_affect_the_rest(work: Path):
+    """With 3 % of the pixels slightly too bright, the rest is within 0.3 dB of the same scene in less light.
 
-    The mask is worth half a decibel and more of the whole picture and of what is near; it costs nothing elsewhere.
+    The mask gains half a decibel near these pixels and in the whole picture, and costs nothing elsewhere.
     """
     rows = {row["told"]: row for row in clipping_rows(work, "sunlit", (*SEEDS, 12), FRAMES)}
     assert rows["with the mask"]["clipped"] == pytest.approx(0.03, abs=0.005)
@@ -54,8 +54,8 @@ def test_overexposed_areas_leave_the_rest_of_the_picture_alone(work: Path):
         assert rows["with the mask"][part] - rows["without"][part] >= 0.5
 
 
-def test_changing_exposure_is_light_and_not_grey(virest, work: Path):
-    """Under auto-exposure frames are restored as ever, each with the light that its own exposure gave."""
+def test_auto_exposure_keeps_the_light_of_each_frame(virest, work: Path):
+    """Under auto-exposure every frame is restored with the light of its own exposure."""
     capture = work / "auto"
     dim = "gain_drift=" + ",".join(["0.5"] * 8)  # so that the brightest exposure does not clip
     simulate_command(capture, width=480, height=360, frames=8, exposure_ms=10.0, rate_rad_s=1.4, response=GAMMA, seed=9,

@@ -1,4 +1,4 @@
-"""Diagnose again with the extended profile, or with the true one: nothing more is found."""
+"""A diagnosis with the extended profile, or the true one, finds nothing more."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _diagnosed(folder: Path, config: Path | None = None) -> Diagnosis:
     [("scene_depth=1.5", 516, {"sway_m": 0.12}), ("frame_lag=0.1,9", 526, {})],
 )
 def test_the_extended_profile_explains_the_capture(work: Path, effect: str, seed: int, options: dict[str, Any]) -> None:
-    """The cause is in the profile's file, and a second diagnosis takes it over."""
+    """The extended profile contains the cause, and a second diagnosis uses it."""
     name, _, value = effect.partition("=")
     folder = _capture(work / f"again_{name}", [effect], seed, **options)
     found = _diagnosed(folder)
@@ -53,7 +53,7 @@ def test_the_extended_profile_explains_the_capture(work: Path, effect: str, seed
 
 
 def test_the_true_profile_has_no_cause(work: Path) -> None:
-    """Its exposure scale, defocus and gains are counted as its own, not as changes."""
+    """Exposure scale, defocus and gains of the profile are not changes."""
     effects = ["exposure_time=0.7", "defocus=1.8", "gain_drift=0.05"]
     folder = _capture(work / "true_profile", effects, 522, exposure_ms=14)
     found = _diagnosed(folder, folder / "truth" / "camera.yaml")
@@ -61,8 +61,8 @@ def test_the_true_profile_has_no_cause(work: Path) -> None:
     assert not found.causes
 
 
-def test_an_unknown_readout_is_written_as_it_was_fitted(work: Path) -> None:
-    """It is no cause, and the extended profile states it; left unknown, the offset fitted beside it would not hold."""
+def test_a_fitted_unknown_readout_is_written(work: Path) -> None:
+    """It is no cause, but the extended profile states it, since the offset fitted with it depends on it."""
     source = open_source(_capture(work / "unknown_readout", [], 518))
     shutter = replace(source.profile.shutter, readout_time_s=0.0)
     given = replace(source.profile, shutter=shutter, readout_known=False, time_offset_s=None)

@@ -1,6 +1,6 @@
-"""Hide something in a capture and find it: the diagnosis sees the folder only.
+"""The diagnosis finds what is hidden in a capture, from the folder alone.
 
-The bench goes through all effects with several seeds; these are the shortest stories.
+The bench runs all effects with several seeds; these are the shortest cases.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _names(found: Diagnosis) -> set[str]:
 
 
 def test_nothing_hidden_is_consistent(work: Path) -> None:
-    """No false alarm."""
+    """There is no false alarm."""
     found = diagnose_folder(_capture(work, "nothing_hidden", [], 421))
     assert found.verdict == CONSISTENT
     assert not found.causes
@@ -43,7 +43,7 @@ def test_nothing_hidden_is_consistent(work: Path) -> None:
 
 
 def test_two_hidden_effects_are_both_named(work: Path) -> None:
-    """One moves points, the other takes light away."""
+    """One shifts points, the other changes the light."""
     hidden = ["time_offset=-0.007", "flicker=0.25,120"]
     found = diagnose_folder(_capture(work, "two_hidden", hidden, 422, exposure_ms=6))
     assert _names(found) == {"time_offset", "flicker"}
@@ -57,8 +57,8 @@ def test_two_hidden_effects_are_both_named(work: Path) -> None:
         assert max(errors) < LARGEST_SIGMA
 
 
-def test_a_filtered_gyroscope_and_pixels_that_are_not_square_are_both_named(work: Path) -> None:
-    """Neither a time offset nor another focal length takes their place; the extended profile has them."""
+def test_a_gyroscope_low_pass_and_non_square_pixels_are_named(work: Path) -> None:
+    """They are not mistaken for a time offset or another focal length, and the extended profile contains them."""
     hidden = {"gyro_lowpass": {"gyro_lowpass_hz": 14.0}, "pixel_aspect": {"pixel_aspect": 0.97}}
     effects = [f"{name}={next(iter(values.values()))}" for name, values in hidden.items()]
     found = diagnose_folder(_capture(work, "filtered_gyroscope", effects, 424))
@@ -74,8 +74,8 @@ def test_a_filtered_gyroscope_and_pixels_that_are_not_square_are_both_named(work
     assert extended.intrinsics.fy_px / extended.intrinsics.fx_px == pytest.approx(0.97, abs=0.005)
 
 
-def test_a_fault_without_a_name_is_described_and_no_cause_stands_in_for_it(work: Path) -> None:
-    """A gyroscope that clips for a third of the time is in no catalogue; its rates are found from the points."""
+def test_an_uncatalogued_fault_is_described(work: Path) -> None:
+    """A clipping gyroscope is not in the catalogue; its rates follow from the tracked points, and no cause is named."""
     folder = _capture(work, "clipping_gyroscope", [], 423)
     log = folder / "gyro_accel.csv"
     head, *rows = log.read_text(encoding="utf-8").splitlines()

@@ -1,4 +1,4 @@
-"""The log's numbers against the same numbers from the true trajectory, computed here once more and another way."""
+"""The log's figures, compared with the true trajectory by an independent calculation."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.scenario
 
 
 class Truth:
-    """The true camera: orientation by spherical interpolation of trajectory.csv, pinhole, times of the slots."""
+    """The true camera: orientation by spherical interpolation of trajectory.csv, a pinhole, and times of the slots."""
 
     def __init__(self, capture: Path) -> None:
         table = np.loadtxt(capture / "truth" / "trajectory.csv", delimiter=",", skiprows=1)
@@ -26,7 +26,7 @@ class Truth:
         self.slots = json.loads((capture / "truth" / "effects.json").read_text())["slots"]
 
     def row_start_s(self, frame: int, x: float, y: float) -> float:
-        """When the row or column through a pixel starts its exposure."""
+        """Start of exposure of the row or column through a pixel."""
         fraction = {
             "top_to_bottom": y / self.height,
             "bottom_to_top": 1 - (y + 1) / self.height,
@@ -36,11 +36,11 @@ class Truth:
         return self.slots[frame]["first_row_start_s"] + fraction * self.shutter["readout_time_s"]
 
     def turn(self, from_s: float, to_s: float) -> Rotation:
-        """Rotation that takes camera coordinates at one time to those at another."""
+        """Rotation from camera coordinates at one time to those at another."""
         return self.world_cam(to_s).inv() * self.world_cam(from_s)
 
     def moved(self, x: float, y: float, from_s: float, to_s: float) -> np.ndarray:
-        """Where a far point seen at a pixel at one time is seen at another."""
+        """Position at another time of a distant point seen at a pixel at one time."""
         ray = self.turn(from_s, to_s).apply(np.linalg.solve(self.camera, [x, y, 1.0]))
         image = self.camera @ ray
         return image[:2] / image[2]
@@ -53,7 +53,7 @@ def wrapped(angle: float) -> float:
 
 @pytest.fixture(scope="module", params=["bottom_to_top", "right_to_left"])
 def case(request: pytest.FixtureRequest, virest, work: Path) -> tuple[Truth, list[dict[str, Any]]]:
-    """Give the truth and the log of a run, with offset, skew and exposure scale that the profile knows."""
+    """The truth and the log of a run whose profile contains offset and exposure scale."""
     capture = work / f"log_{request.param}"
     simulate(
         virest, capture, "--width", 400, "--height", 300, "--frames", 3, "--exposure-ms", 12, "--rate", 2,
@@ -63,8 +63,8 @@ def case(request: pytest.FixtureRequest, virest, work: Path) -> tuple[Truth, lis
     return Truth(capture), process(virest, capture, work / "log", "--deblur", "none", "--config", config).lines
 
 
-def test_the_camera_turn_is_the_true_one(case: tuple[Truth, list[dict[str, Any]]]):
-    """delta_q is the camera's pose at the end of the central row's exposure, seen from its start."""
+def test_the_logged_camera_turn_is_true(case: tuple[Truth, list[dict[str, Any]]]):
+    """delta_q is the camera's orientation at the end of the central row's exposure, relative to its start."""
     truth, lines = case
     for line in lines:
         start_s = truth.row_start_s(line["frame"], (truth.width - 1) / 2, (truth.height - 1) / 2)
@@ -76,8 +76,8 @@ def test_the_camera_turn_is_the_true_one(case: tuple[Truth, list[dict[str, Any]]
         assert start_from_end.magnitude() > 1e-3
 
 
-def test_blur_is_the_path_of_the_point(case: tuple[Truth, list[dict[str, Any]]]):
-    """Angle and length, of the picture's centre and of each tile, are those of the chord that the point draws."""
+def test_the_logged_blur_is_the_chord_of_the_blur_path(case: tuple[Truth, list[dict[str, Any]]]):
+    """Angle and length, for the centre and every tile, are those of the chord of the point's path."""
     truth, lines = case
     for line in lines:
         centre = {**line["blur"], "centre_px": [(truth.width - 1) / 2, (truth.height - 1) / 2]}
@@ -90,8 +90,8 @@ def test_blur_is_the_path_of_the_point(case: tuple[Truth, list[dict[str, Any]]])
                 assert abs(wrapped(tile["angle_rad"] - np.arctan2(chord[1], chord[0]))) < 0.05 / tile["length_px"]
 
 
-def test_corners_go_where_the_first_row_sees_them(case: tuple[Truth, list[dict[str, Any]]]):
-    """corners_px are the corner pixels, each from its own row's start, at the start of the first row's exposure."""
+def test_logged_corners_are_where_the_first_row_sees_them(case: tuple[Truth, list[dict[str, Any]]]):
+    """corners_px are the corner pixels, each from its row's start, at the start of the first row's exposure."""
     truth, lines = case
     corners = [(0, 0), (truth.width - 1, 0), (truth.width - 1, truth.height - 1), (0, truth.height - 1)]
     for line in lines:

@@ -1,4 +1,4 @@
-"""Real phones and cameras: what can be said of their pictures is said, and nothing is damaged with confidence."""
+"""Real phones and cameras: what the pictures determine is reported, and nothing is damaged."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -21,14 +21,14 @@ pytestmark = pytest.mark.scenario
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 CAR_FRAMES = "0:40"
 EXPANSION_PX = (442.0, 328.0)
-"""Where the car drives to, measured from the set itself (its README.md)."""
+"""The focus of expansion, measured from the set itself (its README.md)."""
 DASHBOARD_ROW = 396
 TRACKING = TrackingSettings(grid=(16, 12), halve_above_px=2000, min_corner_levels=8.0)
-"""Strong corners only: noise, which restoration lessens, makes none."""
+"""Strong corners only, since noise, which restoration reduces, makes none of these."""
 
 
-def test_a_capture_within_its_start_up_is_restored_at_its_true_times(virest, realdata: Path, tmp_path: Path):
-    """All 25 frames are later than their stamps: the lag is found and followed, and what it is stands in the log."""
+def test_a_capture_within_its_start_up_is_restored(virest, realdata: Path, tmp_path: Path):
+    """All 25 frames are later than their timestamps; the lag is found and used, and the log has its size."""
     result = process(virest, realdata / "honor_v10", tmp_path, "--preset", "fast")
     counts = result.account["counts"]
     assert counts["failed"] == 0
@@ -40,10 +40,10 @@ def test_a_capture_within_its_start_up_is_restored_at_its_true_times(virest, rea
 
 
 def test_frames_of_a_car_ride_agree_better_with_a_global_shutter(virest, realdata: Path, tmp_path: Path):
-    """At least 90 % of the frames are restored, and between them far points move as a rotation moves them.
+    """Distant points of the restored frames follow a rotation better than those of recorded frames.
 
-    The residual is what a rotation of each pair leaves across the direction of the focus of expansion, where the car's
-    own motion does not reach.
+    At least 90 % of the frames are restored. The residual of each pair's rotation is measured perpendicular to the
+    direction of the focus of expansion, where the car's own motion has no effect.
     """
     capture = realdata / "lhaippp_car"
     result = process(virest, capture, tmp_path, "--preset", "fast", "--frames", CAR_FRAMES)
@@ -60,8 +60,8 @@ def test_frames_of_a_car_ride_agree_better_with_a_global_shutter(virest, realdat
 
 
 @pytest.mark.parametrize("name", ["nexus5_162941", "gopro_karma"])
-def test_captures_with_much_unknown_are_processed_with_reasons(virest, realdata: Path, tmp_path: Path, name: str):
-    """Unknown focal length, exposure or readout ends no run: warnings say what is missing."""
+def test_captures_with_many_unknowns_are_processed(virest, realdata: Path, tmp_path: Path, name: str):
+    """Unknown focal length, exposure or readout ends no run; warnings name what is missing."""
     result = process(virest, realdata / name, tmp_path, "--preset", "fast", "--frames", "0:12")
     assert len(result.lines) == 12
     assert result.account["counts"]["failed"] == 0
@@ -72,12 +72,11 @@ def test_captures_with_much_unknown_are_processed_with_reasons(virest, realdata:
     assert_undamaged(result, realdata / name)
 
 
-def test_a_slow_clock_behind_a_stabiliser_is_named(realdata: Path):
-    """A hand-shaken phone of which next to nothing is known: its clock was measured from two more of its clips.
+def test_a_slow_clock_with_a_stabiliser_is_named(realdata: Path):
+    """The clock skew of a hand-shaken phone is known from two more clips.
 
-    Held-out points do not tell its stabiliser from a principal point elsewhere, and whether either is told beside the
-    clock hangs on where fits end; a stabiliser that is told takes most of the turns.  Much is left, as hand and scene
-    are near.
+    Held-out points do not separate its stabiliser from another principal point; a named stabiliser takes most of the
+    turns. A large residual remains, since hand and scene are near.
     """
     diagnosis = climb_as_command(open_source(realdata / "nexus5_162941"))
     found = {cause.name: cause.parameters for cause in diagnosis.causes}
@@ -86,7 +85,9 @@ def test_a_slow_clock_behind_a_stabiliser_is_named(realdata: Path):
     assert told in ({"stabilisation"}, {"principal_point"}, set())
     skew = found["clock_skew"]["clock_skew"]
     assert skew.estimate == pytest.approx(0.005, abs=0.001)
-    assert abs(skew.estimate - 0.0053) < 2 * np.hypot(skew.std, 0.0002), "the second clip's 0.0053 ± 0.0002"
+    assert abs(skew.estimate - 0.0053) < 2 * np.hypot(skew.std, 0.0002), (
+        "the skew differs from the second clip's 0.0053 ± 0.0002"
+    )
     if "stabilisation" in found:
         assert 0.6 < found["stabilisation"]["fraction"].estimate < 1.0
     rivals = {rival.name for cause in diagnosis.causes for rival in cause.rivals}
@@ -94,8 +95,8 @@ def test_a_slow_clock_behind_a_stabiliser_is_named(realdata: Path):
     assert diagnosis.verdict == UNEXPLAINED
 
 
-def test_pictures_that_the_camera_stabilised_are_copied(virest, realdata: Path, tmp_path: Path):
-    """Where pictures do not follow the gyroscope the run says so, ends with 0, and copies every covered frame."""
+def test_a_movie_stabilised_in_the_camera_is_copied(virest, realdata: Path, tmp_path: Path):
+    """If the pictures do not follow the gyroscope, the run says so, ends with 0, and copies every covered frame."""
     capture = realdata / "gopro_hero7"
     result = process(virest, capture, tmp_path, "--preset", "fast", "--frames", "0:20")
     assert "the frames do not follow the gyroscope" in result.stderr
@@ -110,7 +111,7 @@ def test_pictures_that_the_camera_stabilised_are_copied(virest, realdata: Path, 
 
 
 def assert_unchanged(result: Result, capture: Path, copied: list[dict[str, Any]]) -> None:
-    """Check that copied frames hold exactly the decoded pixels."""
+    """Check that copied frames have exactly the decoded pixels."""
     wanted = {line["frame"]: line for line in copied}
     movie = capture / "movie.mp4"
     for number, picture in read_frames(movie, probe_movie(movie), 0, max(wanted, default=-1)):
@@ -119,7 +120,7 @@ def assert_unchanged(result: Result, capture: Path, copied: list[dict[str, Any]]
 
 
 def assert_undamaged(result: Result, capture: Path) -> None:
-    """Check that restored frames show what the recorded ones show: as bright, and most of their corners found again."""
+    """Check that restored frames are as bright as the recorded ones and keep most of their corners."""
     wanted = {line["frame"]: line for line in result.lines if line["status"] == "restored"}
     movie = capture / "movie.mp4"
     for number, picture in read_frames(movie, probe_movie(movie), 0, max(wanted, default=-1)):
@@ -158,7 +159,7 @@ def grey(picture: Picture) -> Picture:
 
 
 def residuals_px(pairs: Iterable[TrackPair], camera: np.ndarray) -> np.ndarray:
-    """Measure what is left across the expansion, in all pairs, after each pair's own best rotation; far points only."""
+    """Residuals of distant points across the expansion, in all pairs, after each pair's best rotation."""
     left = []
     for pair in pairs:
         far = (pair.points_first_px[:, 1] < DASHBOARD_ROW) & (pair.points_second_px[:, 1] < DASHBOARD_ROW)
@@ -167,7 +168,7 @@ def residuals_px(pairs: Iterable[TrackPair], camera: np.ndarray) -> np.ndarray:
 
 
 def _left_by_rotation(first: np.ndarray, second: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Robust Gauss-Newton over a small rotation vector; the component across the focus of expansion, (n,) px."""
+    """Robust Gauss–Newton over a small rotation vector; the component across the focus of expansion, (n,) px."""
     focal = np.diag(camera)[:2]
     rotation = np.zeros(3)
     weight = np.ones(len(first))

@@ -1,4 +1,4 @@
-"""Restored pictures against truth: every preset gains where there is blur, and none makes any frame worse."""
+"""Restored pictures against truth: every preset gains where there is blur, and none makes a frame worse."""
 
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,12 @@ KINDS: dict[str, tuple[dict[str, Any], tuple[float, float, float]]] = {
         (0.5, 0.5, 0.5),
     ),
 }
-"""What is changed, and what each preset has to gain in the mean over straightening alone, in dB."""
+"""The changed settings, and each preset's least mean gain over straightening alone, in dB."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_preset_gains_and_none_makes_a_frame_worse(virest, work: Path, kind: str):
-    """Each preset gains over straightening alone in the mean, and loses at most 0.1 dB on any frame."""
+    """Each preset gains on average over straightening alone, and loses at most 0.1 dB on any frame."""
     changes, least_db = KINDS[kind]
     capture = work / kind
     simulate_command(capture, **{**HAND, **changes})
@@ -46,8 +46,8 @@ def test_every_preset_gains_and_none_makes_a_frame_worse(virest, work: Path, kin
     assert not complaints, f"{kind}: " + "; ".join(complaints)
 
 
-def test_a_sharp_capture_is_left_alone(virest, work: Path):
-    """Frames whose blur is below a pixel are straightened and not deblurred: no preset changes them otherwise."""
+def test_a_sharp_capture_is_not_deblurred(virest, work: Path):
+    """Frames with less than a pixel of blur are straightened only: ``best`` gives the pictures of ``--deblur none``."""
     options = "--width 320 --height 240 --frames 2 --exposure-ms 1 --rate 1 --seed 10"
     capture = simulate(virest, work / "sharp", *options.split())
     base = process(virest, capture, work / "none", "--deblur", "none")

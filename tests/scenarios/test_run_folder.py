@@ -1,4 +1,4 @@
-"""What a run leaves behind: files, and the keys of every line (contract, section 2)."""
+"""The files of a run, and the keys of every line (section 2 of the contract)."""
 
 import json
 from pathlib import Path
@@ -21,8 +21,8 @@ PARTS = {
 }
 
 
-def test_a_run_leaves_pictures_one_line_a_frame_and_an_account(virest, hand_held: Path, tmp_path: Path):
-    """After ``virest process`` the folder holds one PNG and one line for each frame, in order, and run.json counts."""
+def test_a_run_writes_pictures_lines_and_counts(virest, hand_held: Path, tmp_path: Path):
+    """The folder has one PNG and one line per frame, in order, and run.json has the counts."""
     result = process(virest, hand_held, tmp_path, "--preset", "fast")
     written = {path.relative_to(result.folder).as_posix() for path in result.folder.rglob("*") if path.is_file()}
     assert written == {"parameters.jsonl", "run.json"} | {f"frames/{k:06d}.png" for k in range(4)}
@@ -36,7 +36,7 @@ def test_a_run_leaves_pictures_one_line_a_frame_and_an_account(virest, hand_held
         assert read_png(result.folder / line["output"]).shape == (480, 360, 3)
 
 
-def test_every_line_has_the_keys_that_the_contract_names(virest, hand_held: Path, tmp_path: Path):
+def test_every_line_has_the_documented_keys(virest, hand_held: Path, tmp_path: Path):
     """Each line of a restored frame has every key, with plain numbers of the right size and range."""
     stamps = (hand_held / "frame_timestamps.txt").read_text().splitlines()[1:]
     for line in process(virest, hand_held, tmp_path, "--preset", "fast").lines:
@@ -57,7 +57,7 @@ def test_every_line_has_the_keys_that_the_contract_names(virest, hand_held: Path
         assert 0 <= y0 < y1 <= 480
 
 
-def test_json_gives_the_log_on_standard_output(virest, hand_held: Path, tmp_path: Path):
+def test_json_prints_the_log(virest, hand_held: Path, tmp_path: Path):
     """``--json`` prints exactly the lines of parameters.jsonl, and nothing else, on standard output."""
     arguments = ("--out", tmp_path, "--preset", "fast", "--frames", "1:3", "--json", "--jobs", 2)
     done = virest("process", hand_held, *arguments)

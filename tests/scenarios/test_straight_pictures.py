@@ -1,4 +1,4 @@
-"""Where restored points lie: beside their truth in all four readout directions, and nothing is shifted."""
+"""Restored points are at their true places in all four readout directions, without a shift."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ LARGEST_SHIFT_PX = 0.15
 
 
 def mean_shift_px(result: Result, capture: Path, folder: str = "frames") -> np.ndarray:
-    """Mean over the frames of the shift against truth, (x, y)."""
+    """Mean shift of the frames against truth, (x, y)."""
     shifts = [
         shift_px(result.picture(line), truth_picture(capture, line["frame"], folder), line["valid_px"])
         for line in result.lines
@@ -25,8 +25,8 @@ def mean_shift_px(result: Result, capture: Path, folder: str = "frames") -> np.n
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_straightened_points_lie_at_their_true_places(virest, work: Path, direction: str):
-    """With a short exposure, corners lie within 0.3 px (median) of where a global shutter sees them."""
+def test_straightened_points_are_at_their_true_places(virest, work: Path, direction: str):
+    """With a short exposure the median distance of corners from their global-shutter places is at most 0.3 px."""
     options = f"--width 480 --height 360 --frames 4 --exposure-ms 1 --rate 1.5 --direction {direction} --seed 31"
     capture = simulate(virest, work / direction, *options.split())
     result = process(virest, capture, work / "straight", "--deblur", "none")
@@ -42,14 +42,14 @@ def test_straightened_points_lie_at_their_true_places(virest, work: Path, direct
 
 @pytest.mark.parametrize("preset", ["none", "fast", "best"])
 def test_a_deblurred_and_straightened_picture_is_not_shifted(virest, hand_held: Path, tmp_path: Path, preset: str):
-    """Kernel and warp take the same instant of the exposure: the result lies within 0.15 px of its truth."""
+    """Kernel and warp use the same instant of the exposure, so the result is within 0.15 px of the truth."""
     arguments = ("--deblur", "none") if preset == "none" else ("--preset", preset)
     shift = mean_shift_px(process(virest, hand_held, tmp_path, *arguments), hand_held)
     assert np.linalg.norm(shift) < LARGEST_SHIFT_PX
 
 
-def test_deblurring_without_straightening_is_not_shifted_either(virest, work: Path):
-    """With a readout of 0 and ``--shutter none`` the deblurred picture shows the start of the exposure."""
+def test_deblurring_without_straightening_is_not_shifted(virest, work: Path):
+    """With no readout and ``--shutter none`` the deblurred picture shows the start of the exposure."""
     options = "--width 360 --height 480 --frames 4 --exposure-ms 14 --rate 2 --readout-ms 0 --seed 12"
     capture = simulate(virest, work / "global", *options.split())
     result = process(virest, capture, work / "run", "--shutter", "none", "--preset", "fast")
@@ -58,7 +58,7 @@ def test_deblurring_without_straightening_is_not_shifted_either(virest, work: Pa
 
 
 def test_the_reference_may_be_the_middle_of_the_frame(virest, work: Path):
-    """``--reference frame-middle`` gives the picture of that instant, which lies elsewhere than the default one."""
+    """``--reference frame-middle`` gives the picture of that instant, which differs from that of the default one."""
     options = "--width 360 --height 480 --frames 4 --exposure-ms 10 --rate 2 --reference frame-middle --seed 13"
     capture = simulate(virest, work / "middle", *options.split())
     result = process(virest, capture, work / "run", "--reference", "frame-middle", "--preset", "fast")

@@ -1,4 +1,4 @@
-"""A hand that sways near a wall: displacement and depth found in the capture, or rotation only with the reason."""
+"""A hand swaying near a wall: displacement and depth from the capture, or rotation only, with the reason."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SWAYS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Story:
-    """A capture whose profile knows all but the depth."""
+    """A capture whose profile lacks only the depth."""
 
     capture: Capture
     profile: CameraProfile
@@ -68,7 +68,7 @@ class Story:
         return found
 
     def plan(self, **changes: Any) -> RestorationPlan:
-        """What process plans for the capture."""
+        """The plan of process for the capture."""
         index = probe_movie(self.capture.movie)
 
         def read(numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
@@ -77,17 +77,17 @@ class Story:
         return plan_restoration(self.capture, replace(self.profile, **changes), SETTINGS, read)
 
     def restored(self, plan: RestorationPlan, chosen: range = CHOSEN) -> list[RestoredFrame]:
-        """Chosen frames."""
+        """The chosen frames, restored."""
         movie = self.capture.movie
         pictures = dict(read_frames(movie, probe_movie(movie), 0, max(chosen)))
         return list(restore_frames([(self.capture.frames[k], pictures[k]) for k in chosen], self.capture.imu, plan))
 
     def psnr_db(self, plan: RestorationPlan, chosen: range = CHOSEN) -> np.ndarray[Any, Any]:
-        """Of chosen frames, against truth, away from the edges."""
+        """PSNR of the chosen frames against truth, away from the edges."""
         return self.psnrs_db(self.restored(plan, chosen))
 
     def psnrs_db(self, frames: list[RestoredFrame]) -> np.ndarray[Any, Any]:
-        """Of restored frames, likewise."""
+        """PSNR of restored frames against truth, away from the edges."""
         found = []
         for restored in frames:
             truth = truth_picture(self.capture.folder, restored.frame.index)
@@ -98,7 +98,7 @@ class Story:
 
 @pytest.fixture(scope="module")
 def story(work: Path) -> Callable[[str], Story]:
-    """Make each capture once; its profile is the true one without the depth."""
+    """Simulate each capture once; its profile is the true one without the depth."""
     made: dict[str, Story] = {}
 
     def make(name: str) -> Story:
@@ -114,7 +114,7 @@ def story(work: Path) -> Callable[[str], Story]:
 
 
 def require_close(found: RestorationPlan, story: Story, velocity: float = 0.1, depth: float = 0.05) -> None:
-    """Check velocities (rms error over rms) and depths (each frame) against truth."""
+    """Check velocities (RMS error over RMS) and depths (each frame) against truth."""
     assert found.translations is not None, found.warnings
     assert len(found.translations) == len(story.capture.frames)
     true = story.truth
@@ -125,10 +125,12 @@ def require_close(found: RestorationPlan, story: Story, velocity: float = 0.1, d
 
 
 @pytest.mark.parametrize("name", SWAYS)
-def test_velocity_and_depth_are_found_and_restore_as_well_as_the_true_ones(story: Callable[[str], Story], name: str):
-    """Velocity within 10 %, depth within 5 %; 6 dB above rotation alone, and within 0.2 dB of the true translation.
+def test_estimated_translation_restores_as_well_as_the_true_one(story: Callable[[str], Story], name: str):
+    """Velocities are within 10 % and depths within 5 %.
 
-    But for frames at the edge of what is worth deblurring, which may be deblurred with the one and not with the other.
+    Frames gain 6 dB over rotation and are within 0.2 dB of the truth.
+
+    At most one frame, at the limit of deblurring, may be deblurred with one translation and not with the other.
     """
     told = story(name)
     plan = told.plan()
@@ -145,8 +147,8 @@ def test_velocity_and_depth_are_found_and_restore_as_well_as_the_true_ones(story
     assert (true - found)[alike].max() < 0.2
 
 
-def test_an_unknown_offset_is_found_along(story: Callable[[str], Story]):
-    """Clock, velocity and depth come from one fit where the profile knows none of them."""
+def test_an_unknown_offset_is_estimated_too(story: Callable[[str], Story]):
+    """Clock, velocity and depth come from one fit if the profile has none of them."""
     told = story("landscape")
     plan = told.plan(time_offset_s=None)
     assert plan.copy_reason is None
@@ -155,8 +157,8 @@ def test_an_unknown_offset_is_found_along(story: Callable[[str], Story]):
     require_close(plan, told)
 
 
-def test_a_stated_depth_is_the_one_logged_and_infinity_asks_for_no_translation(story: Callable[[str], Story]):
-    """The velocity is still found in the capture; at infinity nothing is estimated."""
+def test_a_depth_in_the_profile_is_used(story: Callable[[str], Story]):
+    """The velocity is still estimated from the capture; at infinite depth nothing is estimated."""
     told = story("portrait")
     plan = told.plan(depth_m=2.0)
     require_close(plan, told, depth=0.06)
@@ -167,15 +169,15 @@ def test_a_stated_depth_is_the_one_logged_and_infinity_asks_for_no_translation(s
 
 
 def test_accelerations_a_sample_late_do_not_matter(story: Callable[[str], Story]):
-    """Shifting the accelerometer by one row of the log changes neither velocity nor depth."""
+    """Shifting the accelerometer by one row changes neither velocity nor depth noticeably."""
     told = story("landscape")
     imu = told.capture.imu
     late = replace(imu, accel_m_s2=np.roll(imu.accel_m_s2, 1, axis=0))
     require_close(Story(replace(told.capture, imu=late), told.profile).plan(), told)
 
 
-def test_things_before_a_wall_are_restored_at_their_own_depth(work: Path):
-    """A walk past them: their surface brings 1 dB over the wall's plane, and no frame is worse."""
+def test_objects_in_front_of_a_wall_are_restored_at_their_depth(work: Path):
+    """On a walk past them, their surface gains 1 dB over the wall's plane, and no frame becomes worse."""
     walk = SlamCapture(
         "things", "before a wall", width=480, height=360, focal_px=400.0, readout_ms=27.0, exposure_ms=6.0, frames=24,
         walk_m=(0.35, -0.06, 0.08), depth_m=3.0, near_m=1.1, tilt_deg=(9.0, -13.0), seed=63,
@@ -210,12 +212,12 @@ def run(virest: Any, capture: Path, out: Path, depth: str | None, *options: obje
 
 
 def pictures(result: Result) -> list[Picture]:
-    """All that were written."""
+    """All pictures of a run."""
     return [result.picture(line) for line in result.lines]
 
 
-def test_the_log_says_what_was_found_whatever_the_jobs(virest, work: Path, story: Callable[[str], Story]):
-    """Depth and velocity of every frame, the same pictures from one process and from two."""
+def test_the_log_does_not_depend_on_the_number_of_jobs(virest, work: Path, story: Callable[[str], Story]):
+    """Depth and velocity of every frame and the pictures are the same with one process and with two."""
     told = story("landscape")
     folder = told.capture.folder
     one = run(virest, folder, work / "one", None)
@@ -238,8 +240,8 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_does_not_determine_the_translation_is_restored_by_rotation_alone(virest, work: Path, name: str):
-    """With the reason in the log, and the very pictures of a scene at infinity: never worse."""
+def test_an_undetermined_translation_restores_by_rotation_alone(virest, work: Path, name: str):
+    """The log gives the reason, and the pictures are exactly those of a scene at infinity."""
     folder = work / f"refused_{name}"
     size = {"width": 320, "height": 240, "frames": 45}
     simulate_command(folder, **{**USUAL, **size, "seed": 77, "truth_frames": False, **REFUSED[name]})
@@ -256,7 +258,7 @@ def test_what_does_not_determine_the_translation_is_restored_by_rotation_alone(v
 
 
 def shuffle(log: Path) -> None:
-    """Move the accelerations by a second against everything else."""
+    """Shift the accelerations by a second relative to everything else."""
     table = pd.read_csv(log, dtype=str)
     columns = [name for name in table.columns if name.startswith("a")]
     table[columns] = np.roll(table[columns].to_numpy(), 200, axis=0)

@@ -1,4 +1,4 @@
-"""Small captures, written once."""
+"""Small simulated captures, written once."""
 
 import pytest
 from capture_files import SMALL
@@ -16,7 +16,7 @@ def plain_capture(tmp_path_factory):
 
 @pytest.fixture
 def simulate(tmp_path):
-    """Write a small capture with changes: ``simulate("name", effects=["flicker"])`` gives its folder."""
+    """Write a small capture with changed settings: ``simulate("name", effects=["flicker"])`` returns its folder."""
 
     def write(name, **changes):
         simulate_command(tmp_path / name, **{**SMALL, **changes})

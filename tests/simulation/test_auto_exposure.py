@@ -1,4 +1,4 @@
-"""Auto-exposure: exposure × ISO and the picture's brightness move together, and the log says so."""
+"""Auto-exposure changes exposure × ISO and the brightness of pictures together, as logged."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def truth_light(folder: Path, where: np.ndarray[Any, Any] | None = None) -> np.n
 
 @pytest.mark.parametrize("steps", [None, 4])
 def test_light_follows_logged_exposure_times_iso(simulate, steps: int | None) -> None:
-    """With a linear curve and a still camera each picture is as bright as the log says, over the range asked for."""
+    """With a linear curve and a still camera each picture is as bright as logged, over the given range."""
     folder = simulate("auto", **STILL, auto_exposure_ev=2.0, auto_exposure_steps=steps)
     light = logged_light(folder)
     assert np.log2(light.max() / light.min()) == pytest.approx(2.0, abs=0.02)
@@ -41,8 +41,8 @@ def test_light_follows_logged_exposure_times_iso(simulate, steps: int | None) ->
     np.testing.assert_allclose(mean / mean.max(), light / light.max(), rtol=0.02)
 
 
-def test_exposure_and_iso_both_change_and_the_truth_file_says_by_how_much(simulate) -> None:
-    """Neither is held still; truth/effects.json has the factor on the light of every slot."""
+def test_exposure_and_iso_both_change(simulate) -> None:
+    """The file truth/effects.json has the light factor of every slot."""
     folder = simulate("auto", **STILL, auto_exposure_ev=3.0)
     table = pd.read_csv(folder / "movie_metadata.csv")
     assert table["Exposure time[nanosec]"].max() > 2 * table["Exposure time[nanosec]"].min()
@@ -53,8 +53,8 @@ def test_exposure_and_iso_both_change_and_the_truth_file_says_by_how_much(simula
     assert told["settings"]["auto_exposure"] == {"range_ev": 3.0, "steps": None}
 
 
-def test_without_auto_exposure_the_light_stays(simulate) -> None:
-    """Exposures taken in turn change the blur, not the brightness, and no file mentions auto-exposure."""
+def test_without_auto_exposure_the_light_is_constant(simulate) -> None:
+    """Alternating exposures change the blur but not the brightness, and no file mentions auto-exposure."""
     folder = simulate("turns", **STILL, exposure_ms=[4.0, 8.0, 11.0])
     assert np.ptp(truth_light(folder)) == 0.0
     assert np.ptp(logged_light(folder)) < 0.01 * logged_light(folder).mean()
@@ -69,19 +69,19 @@ def test_the_walk_is_smooth_and_reaches_both_ends(rng: np.random.Generator) -> N
 
 
 def test_a_staircase_climbs_in_equal_steps(rng: np.random.Generator) -> None:
-    """Nine frames in three exposures, from dark to bright."""
+    """Nine frames have three exposures, from dark to bright."""
     path = light_path_ev(AutoExposure(5.0, 3), 9, rng)
     np.testing.assert_allclose(path, np.repeat([-2.5, 0.0, 2.5], 3))
 
 
 @pytest.mark.parametrize("steps", [None, 3])
-def test_a_single_frame_is_exposed_as_usual(steps: int | None, rng: np.random.Generator) -> None:
-    """It is neither the dark nor the bright end of a range."""
+def test_a_single_frame_has_the_usual_exposure(steps: int | None, rng: np.random.Generator) -> None:
+    """It is at neither end of the range."""
     assert light_path_ev(AutoExposure(4.0, steps), 1, rng).tolist() == [0.0]
 
 
-def test_exposures_stay_within_the_frame_and_iso_above_its_lowest(rng: np.random.Generator) -> None:
-    """Where one of the two cannot follow the other does; their product is the light all the same."""
+def test_exposure_and_iso_stay_within_their_limits(rng: np.random.Generator) -> None:
+    """If one of them is at its limit, the other changes; their product is the light."""
     plan = plan_exposures((0.008,), AutoExposure(10.0, 21), 21, 30.0, rng)
     assert plan.logged_s.max() <= 1 / 30 + 1e-9
     assert plan.iso.min() >= 50
@@ -89,7 +89,7 @@ def test_exposures_stay_within_the_frame_and_iso_above_its_lowest(rng: np.random
 
 
 @pytest.mark.parametrize(("range_ev", "steps"), [(0.0, None), (-1.0, None), (13.0, None), (4.0, 1), (float("nan"), 3)])
-def test_ranges_that_make_no_sense_are_refused(range_ev: float, steps: int | None) -> None:
-    """A settings error that says what to write."""
+def test_invalid_ranges_are_refused(range_ev: float, steps: int | None) -> None:
+    """A settings error refuses the range or the number of steps."""
     with pytest.raises(SettingsError, match="simulation"):
         AutoExposure(range_ev, steps)

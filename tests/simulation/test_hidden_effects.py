@@ -1,4 +1,4 @@
-"""Hidden effects: each changes its own place in the profile, and nothing that a reader of the capture may see."""
+"""Hidden effects: each changes its own fields of the profile, and nothing visible outside truth/."""
 
 import dataclasses
 import json
@@ -42,17 +42,17 @@ CHANGES = {
     "defocus": "extensions.defocus",
     "sharpening": "",
 }
-"""The contract's table of effects; no profile keeps what the phone does to finished pictures."""
+"""Each effect with the profile keys it changes; processing of finished pictures is in no profile."""
 SEEN_OUTSIDE = ("camera.yaml", "edge_epochs.txt", "frame_timestamps.txt", "movie_metadata.csv")
 
 
 def context(seed=0, frames=20):
-    """Make what default sizes depend on."""
+    """The context that default sizes depend on."""
     return EffectContext(frames, 30.0, np.random.default_rng(seed))
 
 
 def flat(profile):
-    """List the profile's keys, two levels deep, as text."""
+    """The profile's keys, two levels deep, as text."""
     keys = {}
     for name, block in profile_mapping(profile).items():
         for key, value in block.items() if isinstance(block, dict) else [("", block)]:
@@ -60,14 +60,14 @@ def flat(profile):
     return keys
 
 
-def test_every_name_of_the_contract_is_known():
-    """And no other."""
+def test_the_effect_names_are_the_documented_ones():
+    """No other names exist."""
     assert set(EFFECTS) == set(CHANGES)
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_an_effect_changes_its_own_place_in_the_profile_only(name):
-    """The true profile differs from the nominal one at the contract's place, whatever the seed."""
+def test_an_effect_changes_only_its_own_fields(name):
+    """The true profile differs from the nominal one in the documented fields, for several seeds."""
     nominal = nominal_camera(360, 640)
     for seed in range(5):
         true, applied = hide_effects(nominal, [name], context(seed))
@@ -91,13 +91,13 @@ def test_an_effect_changes_its_own_place_in_the_profile_only(name):
         ("gain_drift=1,1.5,0.8", "extensions.gain", "[1.0, 1.5, 0.8]"),
     ],
 )
-def test_given_values_are_taken_as_they_are(text, place, value):
+def test_given_values_are_used_unchanged(text, place, value):
     """``NAME=VALUE`` sets exactly that value."""
     frames = 3 if text.startswith("gain_drift") else 20
     assert flat(hide_effects(nominal_camera(360, 640), [text], context(frames=frames))[0])[place] == value
 
 
-def test_imu_rotation_stands_on_the_left():
+def test_imu_rotation_multiplies_on_the_left():
     """A turn of 90° about camera z takes the camera's x to y: R = exp(r) R_nominal."""
     true, _ = hide_effects(nominal_camera(360, 640), ["imu_rotation=0,0,1.5707963267948966"], context())
     assert np.array(true.r_cam_imu) == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]), abs=1e-12)
@@ -115,8 +115,8 @@ def test_imu_rotation_stands_on_the_left():
         ("gain_drift=1e9", "too much"),
     ],
 )
-def test_a_wrong_effect_says_what_is_right(text, part):
-    """Unknown names, counts and words end in a settings error with a hint."""
+def test_an_invalid_effect_is_refused_with_a_hint(text, part):
+    """Unknown names, wrong counts and invalid values raise a settings error with a hint."""
     with pytest.raises(SettingsError) as caught:
         hide_effects(nominal_camera(360, 640), [text], context())
     assert part in str(caught.value)
@@ -124,7 +124,7 @@ def test_a_wrong_effect_says_what_is_right(text, part):
 
 @pytest.mark.parametrize("name", [n for n in CHANGES if n not in ("scene_depth", "readout_direction")])
 def test_a_hidden_effect_cannot_be_read_outside_truth(name, plain_capture, simulate):
-    """Profile, stamps, metadata and clocks are byte for byte those of the capture without it; truth names it."""
+    """Profile, timestamps, metadata and clocks equal those of the capture without the effect; truth/ names it."""
     folder = simulate("hidden", effects=[name], frames=5)
     for file in SEEN_OUTSIDE:
         assert (folder / file).read_bytes() == (plain_capture / file).read_bytes(), file
@@ -135,8 +135,8 @@ def test_a_hidden_effect_cannot_be_read_outside_truth(name, plain_capture, simul
 
 
 @pytest.mark.parametrize("name", ["gyro_bias", "gyro_scale", "imu_rotation"])
-def test_effects_of_the_imu_leave_the_pictures_alone(name, plain_capture, simulate):
-    """The movie is the same to the byte, the gyroscope is not."""
+def test_imu_effects_do_not_change_the_pictures(name, plain_capture, simulate):
+    """The movie has the same bytes; the gyroscope data differ."""
     folder = simulate("imu", effects=[name])
     assert (folder / "movie.mp4").read_bytes() == (plain_capture / "movie.mp4").read_bytes()
     assert np.abs(read_imu(folder)[1] - read_imu(plain_capture)[1]).max() > 0.01
@@ -146,21 +146,21 @@ def test_effects_of_the_imu_leave_the_pictures_alone(name, plain_capture, simula
     "name", ["time_offset", "readout_time", "timestamp_reference", "exposure_time", "focal_length", "radial_distortion",
              "stabilisation", "vignetting", "flicker", "gain_drift", "defocus", "black_level", "clock_skew=0.02"]
 )  # fmt: skip
-def test_effects_of_the_camera_leave_the_imu_alone(name, plain_capture, simulate):
-    """The inertial data are the same to the byte, the pictures are not."""
+def test_camera_effects_do_not_change_the_imu(name, plain_capture, simulate):
+    """The inertial data have the same bytes; the movie differs."""
     folder = simulate("camera", effects=[name])
     assert (folder / "gyro_accel.csv").read_bytes() == (plain_capture / "gyro_accel.csv").read_bytes()
     assert (folder / "movie.mp4").read_bytes() != (plain_capture / "movie.mp4").read_bytes()
 
 
 def test_gyro_is_scale_times_true_plus_bias(plain_capture, simulate):
-    """Measured = scale × true + bias, sample by sample."""
+    """Each sample is scale × true + bias."""
     folder = simulate("gyro", effects=["gyro_scale=1.1", "gyro_bias=0.1,-0.2,0.3"])
     assert read_imu(folder)[1] == pytest.approx(1.1 * read_imu(plain_capture)[1] + [0.1, -0.2, 0.3], abs=1e-6)
 
 
-def test_frames_are_taken_at_the_times_that_the_clocks_say(simulate):
-    """(t_cam − half the true exposure)(1 + skew) + offset, by hand for frame 3 at 100 ms."""
+def test_frames_are_taken_at_the_times_of_the_clock_model(simulate):
+    """The start of frame 3 is (t_cam − half the true exposure)(1 + skew) + offset, computed by hand at 100 ms."""
     effects = ["time_offset=0.05", "clock_skew=0.01", "timestamp_reference=exposure_middle", "exposure_time=1.5"]
     told = json.loads((simulate("clock", effects=effects) / "truth" / "effects.json").read_text())
     assert told["slots"][3]["exposure_s"] == pytest.approx(0.012)
@@ -168,8 +168,8 @@ def test_frames_are_taken_at_the_times_that_the_clocks_say(simulate):
     assert told["slots"][3]["middle_s"] == pytest.approx(told["slots"][3]["first_row_start_s"] + 0.009 + 0.006)
 
 
-def test_start_up_lag_shows_later_frames_and_uses_them_up_by_repeats(simulate):
-    """Lag of 3 frames over 6 slots: repeats at slots 2, 4 and 6; repeated pictures are the same."""
+def test_a_start_up_lag_ends_through_repeats(simulate):
+    """A lag of 3 frames over 6 slots gives repeats at slots 2, 4 and 6; repeated pictures are nearly equal."""
     folder = simulate("lag", effects=["frame_lag=0.1,6"], frames=9, noise_levels=3.0)
     told = json.loads((folder / "truth" / "effects.json").read_text())
     assert [slot["shows"] for slot in told["slots"]] == [3, 4, 4, 5, 5, 6, 6, 7, 8]
@@ -179,7 +179,7 @@ def test_start_up_lag_shows_later_frames_and_uses_them_up_by_repeats(simulate):
 
 
 def test_scene_depth_makes_the_hand_sway_at_that_distance(simulate):
-    """The median over the frames of the distance along the optical axis is the effect's depth."""
+    """The median distance of frames along the optical axis is the effect's depth."""
     folder = simulate("depth", effects=["scene_depth=0.6"])
     told = json.loads((folder / "truth" / "effects.json").read_text())
     path = np.loadtxt(folder / "truth" / "trajectory.csv", delimiter=",", skiprows=1)
@@ -193,8 +193,8 @@ def test_scene_depth_makes_the_hand_sway_at_that_distance(simulate):
     assert dataclasses.asdict(read_profile(folder / "camera.yaml"))["depth_m"] == np.inf
 
 
-def test_two_effects_do_not_disturb_each_other(simulate):
-    """Both stand in the true profile."""
+def test_two_effects_combine(simulate):
+    """Both are in the true profile."""
     folder = simulate("two", effects=["time_offset=0.01", "vignetting=0.4"])
     true = read_profile(folder / "truth" / "camera.yaml")
     assert (true.time_offset_s, true.extensions.vignetting_corner_loss) == (0.01, 0.4)
@@ -202,7 +202,7 @@ def test_two_effects_do_not_disturb_each_other(simulate):
 
 
 def test_sharpening_is_hidden_in_the_phones_processing(simulate):
-    """Its values stand among the effects and in the strengths; the radius may be left out, and is drawn."""
+    """The effects and the ISP strengths contain its values; a radius that is not given is drawn at random."""
     folder = simulate("sharp", frames=2, effects=["sharpening=1.3"])
     truth = json.loads((folder / "truth/effects.json").read_text(encoding="utf-8"))
     values = truth["effects"][0]["parameters"]
@@ -211,8 +211,8 @@ def test_sharpening_is_hidden_in_the_phones_processing(simulate):
     assert truth["isp"] == {"sharpen": 1.3, "sharpen_radius_px": values["radius_px"]}
 
 
-def test_a_low_pass_makes_rates_late_and_fast_ones_small():
-    """At a tenth of the cutoff a delay of √2 / (2π f); at the cutoff 3 dB less and a quarter period late; by hand."""
+def test_a_low_pass_delays_rates_and_attenuates_fast_ones():
+    """A tenth of the cutoff is delayed by √2 / (2π f); the cutoff loses 3 dB and a quarter period, computed by hand."""
     time_s = np.arange(400) / 200
 
     def passed(frequency_hz):
@@ -226,17 +226,17 @@ def test_a_low_pass_makes_rates_late_and_fast_ones_small():
     assert passed(20.0) == pytest.approx(-np.cos(2 * np.pi * 20.0 * time_s) / np.sqrt(2), abs=3e-3)
 
 
-def test_a_hidden_low_pass_is_in_the_log_and_nowhere_else(simulate):
-    """The same motion and movie; slow rates of the log come later by the filter's delay."""
+def test_a_hidden_low_pass_changes_only_the_gyroscope_log(simulate):
+    """Motion and movie are the same; the log's rates come later by the filter's delay."""
     plain, late = (simulate(name, frames=30, effects=e) for name, e in (("none", []), ("late", ["gyro_lowpass=15"])))
     assert (plain / "movie.mp4").read_bytes() == (late / "movie.mp4").read_bytes()
     before, after = (read_imu(folder)[1][:, :3] for folder in (plain, late))
     lags = [np.sum(before[20 : 120 - k] * after[20 + k : 120]) for k in range(8)]
-    assert np.argmax(lags) in (2, 3, 4)  # 15 ms of samples 5 ms apart, and a little less where turns are fast
+    assert np.argmax(lags) in (2, 3, 4)  # a delay of 15 ms is three samples of 5 ms, and a little less for fast turns
 
 
-def test_a_motion_is_taken_again_from_behind_a_low_pass(rng):
-    """What a filter of 12 Hz made of a hand's shake, turned back: 50 times nearer to it than as logged."""
+def test_a_low_pass_can_be_inverted(rng):
+    """Inverting a filter of 12 Hz brings a hand's rates 50 times closer to the true ones than the log."""
     motion = random_hand_motion(rng, rate_rms_rad_s=1.0, duration_s=2.0, band_hz=(0.5, 8.0))
     time_s = np.arange(-0.5, 2.5, 0.005)
     true, logged = motion.rate_rad_s(time_s), low_passed_rate(motion.rate_rad_s, time_s, [12.0])
@@ -245,8 +245,8 @@ def test_a_motion_is_taken_again_from_behind_a_low_pass(rng):
     assert np.std((found - true)[inner]) < 0.02 * np.std((logged - true)[inner])
 
 
-def test_a_shadow_passes_at_its_time_over_its_place():
-    """On top of what always darkens the picture; x to the right, y down, as parts of the picture."""
+def test_a_shadow_covers_its_place_at_its_time():
+    """It multiplies the constant shading. Coordinates are fractions of the picture, x to the right and y down."""
     hidden = Hidden(
         light=lambda x, y: 1 - 0.5 * y, shadow=lambda stamp_s, x, y: np.where((stamp_s > 1) & (x > 0.5), 0.25, 1.0)
     )
@@ -257,8 +257,8 @@ def test_a_shadow_passes_at_its_time_over_its_place():
 
 
 @pytest.mark.parametrize("longer", [0.5, 2.2])
-def test_another_focal_length_is_no_defocus(longer):
-    """The lens blurs by pixels of its own, however much of the scene one of them sees."""
+def test_another_focal_length_does_not_defocus(longer):
+    """The lens blurs by a number of pixels, whatever angle a pixel covers."""
     nominal = nominal_camera(200, 150)
     lens = nominal.intrinsics
     other = dataclasses.replace(lens, fx_px=longer * lens.fx_px, fy_px=longer * lens.fy_px)

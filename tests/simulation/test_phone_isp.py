@@ -1,4 +1,4 @@
-"""What a phone does to its pictures and samples: each strength against its own law, and the capture as a whole."""
+"""A phone's processing of pictures and samples: each strength against its own law, and whole captures."""
 
 import dataclasses
 from pathlib import Path
@@ -28,7 +28,7 @@ LUMA = np.array([0.299, 0.587, 0.114])
 
 
 def grey_noise(rng, sigma=0.02, level=0.5, size=(90, 120)):
-    """A flat grey with the sensor's noise in every channel."""
+    """A flat grey picture with independent noise in every channel."""
     return (level + sigma * rng.standard_normal((*size, 3))).astype(np.float32)
 
 
@@ -41,7 +41,7 @@ def luma_of(picture):
 
 
 def test_highlights_bend_at_the_knee_and_never_clip():
-    """The knee of 0.25 is at 0.75: below nothing changes; at 1 light is 0.75 + 0.25 (1 − 1/e), at 5 just below 1."""
+    """With a knee of 0.25, light below 0.75 is unchanged, light 1 becomes 0.75 + 0.25 (1 − 1/e), and 5 almost 1."""
     light = np.array([0.3, 0.75, 1.0, 5.0], np.float32)
     expected = [0.3, 0.75, 0.75 + 0.25 * (1 - np.exp(-1)), 1.0]
     assert roll_off_highlights(light, 0.25) == pytest.approx(expected, abs=1e-6)
@@ -52,14 +52,14 @@ def test_highlights_bend_at_the_knee_and_never_clip():
 
 
 def test_the_tone_curve_keeps_both_ends_and_the_middle():
-    """At 0.25 half of an S gives ½ · 0.25 + ½ · 0.15625; the slope in the middle is 1.25."""
+    """At 0.25 half an S curve gives ½ · 0.25 + ½ · 0.15625; the slope in the middle is 1.25."""
     assert tone_curve(np.array([0.0, 0.25, 0.5, 1.0], np.float32), 0.5) == pytest.approx([0.0, 0.203125, 0.5, 1.0])
     near = tone_curve(np.array([0.49, 0.51]), 0.5)
     assert (near[1] - near[0]) / 0.02 == pytest.approx(1.25, rel=1e-3)
 
 
-def test_denoising_takes_more_of_the_chroma_than_of_the_luma_and_keeps_an_edge(rng):
-    """Flat grey loses more than half of its luma noise; a step of 15 deviations stays as sharp as it was."""
+def test_denoising_keeps_edges_and_affects_chroma_most(rng):
+    """Flat grey loses more than half of its luma noise, and chroma more; a step of 15 deviations stays sharp."""
     noisy = grey_noise(rng)
     noisy[:, 60:] += 0.3
     clean = denoise_in_space(noisy, 1.5 * 0.02)
@@ -71,16 +71,16 @@ def test_denoising_takes_more_of_the_chroma_than_of_the_luma_and_keeps_an_edge(r
     assert step == pytest.approx(0.3, abs=0.015)
 
 
-def test_a_still_scene_is_averaged_over_time_as_a_recursive_filter_does(rng):
-    """Share w leaves √((1 − w)/(1 + w)) of the noise; the loss to seeming motion is small."""
+def test_a_still_scene_is_averaged_recursively(rng):
+    """A share w leaves √((1 − w)/(1 + w)) of the noise, with little loss to apparent motion."""
     phone = PhonePictures(PhoneIsp(temporal_denoise=0.6), 0.02)
     for _ in range(12):
         out = phone.develop(grey_noise(rng))
     assert out.std() / 0.02 == pytest.approx(np.sqrt(0.4 / 1.6), rel=0.12)
 
 
-def test_what_moves_leaves_no_ghost(rng):
-    """A bright square that jumps: where it was, nothing of it stays."""
+def test_a_moving_object_leaves_no_ghost(rng):
+    """After a bright square jumps, its old place shows only the background."""
     phone = PhonePictures(PhoneIsp(temporal_denoise=0.8), 0.01)
     first, second = grey_noise(rng, 0.01), grey_noise(rng, 0.01)
     first[30:60, 20:50] += 0.3
@@ -90,19 +90,19 @@ def test_what_moves_leaves_no_ghost(rng):
 
 
 def test_an_unsharp_mask_overshoots_beside_an_edge_by_its_amount():
-    """Beside a step of 0.4, half a pixel from it, the mask adds 0.4 · amount · Φ(−0.5/radius)."""
+    """Half a pixel beside a step of 0.4, the mask adds 0.4 · amount · Φ(−0.5/radius)."""
     step = np.full((40, 60, 3), 0.3, np.float32)
     step[:, 30:] = 0.7
     sharp = sharpen(step, 0.8, 1.4)
     beyond = 0.5 * float(cv2.getGaussianKernel(41, 1.4)[20, 0])
-    below_half = 0.5 - beyond  # the sampled Gaussian's mass on one side of its middle sample
+    below_half = 0.5 - beyond  # share of the sampled Gaussian on one side of its middle sample
     assert sharp[20, 30, 1] - 0.7 == pytest.approx(0.4 * 0.8 * below_half, rel=0.01)
     assert 0.3 - sharp[20, 29, 1] == pytest.approx(0.4 * 0.8 * below_half, rel=0.01)
     assert sharp[20, 5] == pytest.approx(0.3, abs=1e-6)
 
 
-def test_local_tones_compress_what_is_coarse_and_keep_what_is_fine():
-    """Two halves of 0.2 and 0.8 with a fine pattern: their ratio is raised to 1 − strength, the pattern's is kept."""
+def test_local_tone_mapping_compresses_coarse_contrast_only():
+    """The ratio of two halves, 0.2 and 0.8, is raised to 1 − strength; a fine pattern keeps its contrast."""
     pattern = 1 + 0.1 * np.sin(np.arange(400) * 2.1)
     picture = np.where(np.arange(400) < 200, 0.2, 0.8) * pattern
     picture = np.repeat(np.repeat(picture[None, :, None], 300, 0), 3, 2).astype(np.float32)
@@ -116,8 +116,8 @@ def test_local_tones_compress_what_is_coarse_and_keep_what_is_fine():
 # ── the gyroscope ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_the_low_pass_loses_half_the_power_at_its_corner_and_no_time_below_it():
-    """A slow rate passes unchanged and undelayed; at the corner its amplitude is 1/√2."""
+def test_the_low_pass_halves_the_power_at_its_corner():
+    """A slow rate passes unchanged and without delay; at the corner its amplitude is 1/√2."""
     time_s = np.arange(0.1, 1.5, 1 / 200)
 
     def passed(frequency_hz):
@@ -132,8 +132,11 @@ def test_the_low_pass_loses_half_the_power_at_its_corner_and_no_time_below_it():
     assert corner.std() * np.sqrt(2) == pytest.approx(1 / np.sqrt(2), rel=0.01)
 
 
-def test_noise_density_and_jitter_have_their_sizes(rng):
-    """0.001 rad/s/√Hz at 200 samples/s is 0.01 rad/s; behind a low pass of 40 Hz it is √(1.11 · 40 / 100) of that."""
+def test_noise_density_and_jitter_have_the_given_sizes(rng):
+    """A density of 0.001 rad/s/√Hz at 200 Hz gives 0.01 rad/s.
+
+    After a low pass of 40 Hz it gives √(1.11 · 40 / 100) of that.
+    """
     assert gyro_noise(0.001, 200.0, [], (20000, 3), rng).std() == pytest.approx(0.01, rel=0.02)
     low = gyro_noise(0.001, 200.0, [40.0], (20000, 3), rng)
     assert low.std() == pytest.approx(0.01 * np.sqrt(1.11 * 40 / 100), rel=0.05)
@@ -154,8 +157,8 @@ def phone_capture(tmp_path_factory):
     return folder
 
 
-def test_the_capture_says_nothing_of_the_phone(phone_capture: Path, plain_capture: Path):
-    """camera.yaml and the frames' log are those of a capture without; truth/ holds offset and stabiliser."""
+def test_only_the_truth_folder_shows_the_phone(phone_capture: Path, plain_capture: Path):
+    """Profile and frame logs equal those of a capture without a phone; truth/ has time offset and stabiliser."""
     for name in ("camera.yaml", "frame_timestamps.txt", "movie_metadata.csv"):
         assert (phone_capture / name).read_bytes() == (plain_capture / name).read_bytes(), name
     true = read_profile(phone_capture / "truth/camera.yaml")
@@ -164,14 +167,14 @@ def test_the_capture_says_nothing_of_the_phone(phone_capture: Path, plain_captur
 
 
 def test_the_same_seed_gives_the_same_phone(phone_capture: Path, tmp_path: Path):
-    """Movie and samples, byte for byte; they differ from those of a capture without."""
+    """The same seed gives the same bytes of movie, samples and truth."""
     simulate_command(tmp_path / "again", **SMALL, isp=ISPS["phone"])
     for name in ("movie.mp4", "gyro_accel.csv", "truth/effects.json", "truth/frames/000003.png"):
         assert (tmp_path / "again" / name).read_bytes() == (phone_capture / name).read_bytes(), name
 
 
-def test_truth_has_the_global_curves_and_nothing_else(simulate):
-    """Denoising, sharpening, local tones leave truth/ as it is; the tone curve acts on each of its levels."""
+def test_truth_includes_only_global_curves(simulate):
+    """Denoising, sharpening and local tone mapping do not change truth/; the tone curve acts on each level."""
     still = {"rate_rad_s": 0.0, "frames": 2}
 
     def truth(name, **strengths):
@@ -186,7 +189,7 @@ def test_truth_has_the_global_curves_and_nothing_else(simulate):
 
 
 def test_the_movie_shows_the_sharpening(simulate):
-    """A still scene, sharpened: the movie's contrast at fine scales grows."""
+    """Sharpening a still scene increases the movie's fine contrast by more than half."""
 
     def detail(name, **strengths):
         luma, _ = read_movie(simulate(name, rate_rad_s=0.0, frames=2, crf=2.0, isp=PhoneIsp(**strengths)))
@@ -195,8 +198,8 @@ def test_the_movie_shows_the_sharpening(simulate):
     assert detail("sharp", sharpen=1.0) > 1.5 * detail("plain")
 
 
-def test_the_log_shows_the_noise_of_the_gyroscope(simulate):
-    """Rates of a camera at rest are the noise alone; stamps that jitter are not evenly spaced."""
+def test_the_log_has_gyroscope_noise_and_jitter(simulate):
+    """The rates of a resting camera are noise alone, and timestamps with jitter are not evenly spaced."""
     isp = PhoneIsp(gyro_noise=0.001, gyro_jitter_s=0.0003)
     time_ns, gyro, _ = read_imu(simulate("noisy", rate_rad_s=0.0, frames=30, isp=isp))
     assert gyro.std() == pytest.approx(0.01, rel=0.1)
@@ -204,7 +207,7 @@ def test_the_log_shows_the_noise_of_the_gyroscope(simulate):
 
 
 def test_jitter_has_a_random_stream_of_its_own():
-    """Objects before the scene are drawn from [seed, 7]; without them the jitter is, as in all earlier captures."""
+    """Near objects are drawn from [seed, 7], and so is the jitter in captures without them."""
 
     def jitter_s(near_m):
         settings = SessionSettings(frames=30, seed=5, near_m=near_m)
@@ -224,14 +227,14 @@ def test_jitter_has_a_random_stream_of_its_own():
 @pytest.mark.parametrize(
     "strengths", [{"tone": 1.5}, {"denoise": -1}, {"bits_per_px": 0.0}, {"gyro_lowpass_hz": 2000}, {"local_tone": 1}]
 )
-def test_a_strength_that_no_phone_has_is_refused(strengths):
-    """With its name, its value and what is allowed."""
+def test_an_invalid_strength_is_refused(strengths):
+    """The error names the strength."""
     with pytest.raises(SettingsError, match=next(iter(strengths))):
         make_isp("phone", **strengths)
 
 
 def test_a_phone_has_one_stabiliser():
-    """A rest beside a stabiliser that the true profile has already would be two."""
+    """A residual of stabilisation and a stabiliser in the true profile would be two stabilisers."""
     profile = CameraProfile(64, 48, extensions=Extensions(stabilisation_fraction=0.5))
     with pytest.raises(SettingsError, match="two stabilisers"):
         PhoneIsp(stabiliser_rest=0.1).true_profile(profile)

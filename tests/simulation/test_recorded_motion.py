@@ -1,4 +1,4 @@
-"""A capture taken once more: its own motion, times and exposures, before one of its own pictures."""
+"""Re-creation of a capture with its own motion, times and exposures, in front of one of its own pictures."""
 
 import dataclasses
 import json
@@ -38,14 +38,14 @@ PROFILE = CameraProfile(
 
 @pytest.fixture(scope="module")
 def lively(tmp_path_factory):
-    """A capture in which the phone turns by several pixels a frame."""
+    """A capture in which the camera turns by several pixels per frame."""
     folder = tmp_path_factory.mktemp("like") / "lively"
     simulate_command(folder, **LIVELY)
     return folder
 
 
-def test_a_motion_comes_back_from_its_samples(rng):
-    """Sampled at 200 Hz through scale, bias and axes, a hand's turns are recovered to a tenth of a milliradian."""
+def test_a_motion_is_recovered_from_its_samples(rng):
+    """Sampled at 200 Hz with scale, bias and rotated axes, a hand's turns are recovered within 0.1 mrad."""
     hand = random_hand_motion(rng, rate_rms_rad_s=1.5, duration_s=1.0)
     sample_s = np.arange(-0.8, 1.8, 0.005)
     measured = hand.rate_rad_s(sample_s) @ np.array(TILTED) * PROFILE.gyro_scale + PROFILE.gyro_bias_rad_s
@@ -57,8 +57,8 @@ def test_a_motion_comes_back_from_its_samples(rng):
     assert not again.position_m(time_s).any()
 
 
-def test_a_rate_is_held_beyond_its_samples_and_passes_through_them(rng):
-    """Nothing is known outside; inside, the samples stand, and a gap does not ring."""
+def test_a_rate_is_held_outside_its_samples(rng):
+    """Outside the samples the rate is constant; inside a gap it does not overshoot by large factors."""
     sample_s = np.array([0.0, 0.005, 0.01, 0.4, 0.405, 0.412])
     rate = recorded_rate(sample_s, rng.normal(size=(6, 3)), dataclasses.replace(PROFILE, r_cam_imu=np.eye(3).tolist()))
     at = rate.at(sample_s)
@@ -68,14 +68,14 @@ def test_a_rate_is_held_beyond_its_samples_and_passes_through_them(rng):
     assert np.abs(gap).max() < 40 * np.abs(at).max()
 
 
-def test_one_sample_is_no_motion():
-    """An error of the tree says how many there are."""
+def test_a_single_sample_is_refused():
+    """The error gives the number of samples."""
     with pytest.raises(ImuError, match="1 gyroscope"):
         recorded_rate(np.zeros(1), np.zeros((1, 3)), PROFILE)
 
 
-def test_times_counted_from_a_later_frame_are_the_same_instants():
-    """Clock, focal drift, flicker, gains and lag mean the same when the first frames are cut off."""
+def test_a_profile_counted_from_a_later_frame_is_equivalent():
+    """Clock, focal drift, flicker, gains and lag describe the same instants after the first frames are cut off."""
     extensions = Extensions(
         focal_drift_per_s=0.02, flicker_amplitude=0.2, flicker_frequency_hz=97.0, flicker_phase_rad=0.7,
         gain=(1.0, 1.1, 0.9, 1.2), frame_lag_s=0.2, frame_lag_frames=4,
@@ -95,15 +95,15 @@ def test_times_counted_from_a_later_frame_are_the_same_instants():
     assert np.isinf(cut.depth_m)
 
 
-def test_frames_whose_motion_is_unknown_are_left_out():
-    """The recorder's start-up is taken again; a frame in a hole of the inertial data is not."""
+def test_frames_with_unknown_motion_are_left_out():
+    """Start-up frames are re-created; a frame inside a gap of the inertial data is not."""
     frames = [Frame(0, 0, 0.0, skip_reason="late", skip_codes=("start-up",)), Frame(1, 1, 0.1)]
     hole = Frame(2, 2, 0.2, skip_reason="hole", skip_codes=("imu-gap",))
     assert known_frames([*frames, hole]) == tuple(frames)
 
 
-def test_a_re_creation_has_the_capture_s_own_numbers_and_nearly_its_pictures(lively, tmp_path):
-    """Samples and stamps are equal row by row; pictures differ by a small part of what the motion changes."""
+def test_a_re_creation_has_the_same_data_and_similar_pictures(lively, tmp_path):
+    """Samples and timestamps are equal; pictures differ by a small part of the change by motion."""
     again = tmp_path / "again"
     facts = simulate_like(again, lively, noise_levels=0.5)
     assert facts["frames"] == 7
@@ -122,8 +122,8 @@ def test_a_re_creation_has_the_capture_s_own_numbers_and_nearly_its_pictures(liv
     assert apart.max() < 0.6 * moved
 
 
-def test_an_effect_hides_in_a_re_creation_of_some_frames(lively, tmp_path):
-    """The profile beside the movie stays innocent, the truth knows, and the scene stays before the camera."""
+def test_an_effect_can_be_hidden_in_a_partial_re_creation(lively, tmp_path):
+    """Only the truth folder's profile has the effect, and the scene stays in front of the camera."""
     again = tmp_path / "again"
     facts = simulate_like(again, lively, frames=slice(2, 6), effects=["readout_time=0.009"], seed=5)
     assert facts["frames"] == 4
@@ -136,7 +136,7 @@ def test_an_effect_hides_in_a_re_creation_of_some_frames(lively, tmp_path):
 
 
 def test_brighter_exposures_make_brighter_pictures(simulate, tmp_path):
-    """Exposure times ISO, as logged, is what the light of a re-creation follows."""
+    """The light of a re-creation follows the logged exposure × ISO."""
     bracket = simulate("bracket", auto_exposure_ev=2.0, auto_exposure_steps=2, rate_rad_s=0.3, frames=6)
     again = tmp_path / "again"
     simulate_like(again, bracket)
@@ -145,8 +145,8 @@ def test_brighter_exposures_make_brighter_pictures(simulate, tmp_path):
     np.testing.assert_allclose(levels[1], levels[0], atol=6)
 
 
-def test_a_view_past_the_scene_is_refused(simulate, tmp_path):
-    """One picture holds no scene behind the camera; the hint names --frames."""
+def test_a_view_beyond_the_scene_is_refused(simulate, tmp_path):
+    """One picture has no scene behind the camera; the hint names --frames."""
     spinning = simulate("spinning", gyro_noise_rad_s=0.0)
     table = (spinning / "gyro_accel.csv").read_text().splitlines()
     rows = [row.split(",") for row in table[1:]]
@@ -158,8 +158,11 @@ def test_a_view_past_the_scene_is_refused(simulate, tmp_path):
     assert not (tmp_path / "again").exists()
 
 
-def test_what_cannot_be_taken_again_is_said(lively, tmp_path):
-    """No focal length, no exposures, steps, and the capture itself as the output."""
+def test_invalid_re_creations_are_refused(lively, tmp_path):
+    """The capture itself as output, steps between frames, and a range without frames are refused.
+
+    A changed exposure scale in the profile is accepted.
+    """
     with pytest.raises(OutputError):
         simulate_like(lively, lively)
     with pytest.raises(SettingsError, match="consecutive frames"):
@@ -173,8 +176,11 @@ def test_what_cannot_be_taken_again_is_said(lively, tmp_path):
     assert facts["blur_px"] > 0
 
 
-def test_the_command_takes_the_camera_and_the_times_from_the_capture(lively, tmp_path, capfd):
-    """``--like``: --frames A:B chooses; what would be ignored is refused (2), what is no capture too (4)."""
+def test_the_command_re_creates_a_capture(lively, tmp_path, capfd):
+    """``--like`` uses the capture's camera and times, and ``--frames A:B`` selects frames.
+
+    Options that would be ignored end with 2, a folder without a capture with 4, and an unknown effect with 3.
+    """
     again = tmp_path / "again"
     assert cli.run(["simulate", str(again), "--like", str(lively), "--frames", "1:4", "--json"]) == 0
     facts = json.loads(capfd.readouterr().out)

@@ -1,4 +1,4 @@
-"""Things that hang before a plane: nearer, so they move more, and they hide what is behind them."""
+"""Objects in front of a plane: they are nearer, so they move more, and they hide what is behind them."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ PLACE_M = np.array([0.12, -0.07, 0.15])
 
 
 def chart(rng: np.random.Generator) -> np.ndarray:
-    """A smooth chart whose colours tell the place: red grows with x, green with y."""
+    """A smooth chart whose colours encode the place: red grows with x, green with y."""
     y, x = np.mgrid[0:80, 0:120].astype(np.float32)
     return np.dstack([x / 120, y / 80, np.full_like(x, float(rng.uniform(0.1, 0.9)))]).astype(np.float32)
 
 
 def colour_at(pixel: np.ndarray, blue: float) -> np.ndarray:
-    """Colour of a place of the chart."""
+    """Colour at a place of the chart."""
     return np.array([pixel[0] / 120, pixel[1] / 80, blue])
 
 
 def ray_to(point_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x/z and y/z of a world point from the moved camera."""
+    """x/z and y/z of a world point seen from the moved camera."""
     seen = POSE.inv().apply(point_m - PLACE_M)
     return np.full((1, 1), seen[0] / seen[2], np.float32), np.full((1, 1), seen[1] / seen[2], np.float32)
 
 
 def relief(rng: np.random.Generator) -> tuple[ReliefScene, float, float]:
-    """A relief whose nearer plane covers the chart left of its middle; the two planes' blues."""
+    """A relief whose nearer plane covers the left half of the chart, and the blue values of both planes."""
     far, near = chart(rng), chart(rng)
     cover = np.zeros((80, 120, 1), np.float32)
     cover[:, :60] = 1
@@ -39,8 +39,8 @@ def relief(rng: np.random.Generator) -> tuple[ReliefScene, float, float]:
     return ReliefScene(far, FOCAL, FAR_M, (0.0, 0.0, 1.0), nearer=(before,)), float(far[0, 0, 2]), float(near[0, 0, 2])
 
 
-def test_a_point_of_each_plane_is_seen_where_its_ray_goes(rng: np.random.Generator):
-    """From a camera that has moved and turned, the nearer plane hides the farther one, and a gap does not."""
+def test_a_point_of_each_plane_is_seen_along_its_ray(rng: np.random.Generator):
+    """From a moved and turned camera, the nearer plane hides the farther one except at its gap."""
     scene, far_blue, near_blue = relief(rng)
     both = scene.chart_from_ray(POSE.as_matrix(), PLACE_M)
     on_near = np.array([-0.31, 0.11, NEAR_M])
@@ -52,7 +52,7 @@ def test_a_point_of_each_plane_is_seen_where_its_ray_goes(rng: np.random.Generat
 
 
 def test_poses_at_several_times_give_pairs_of_homographies(rng: np.random.Generator):
-    """One pair for each pose, the same as one by one."""
+    """Each pose has one pair, the same as when computed alone."""
     scene, *_ = relief(rng)
     turns = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.2, 0.3], [0, -0.2, 0]]).as_matrix()
     places = np.array([[0, 0, 0], [0.1, 0, 0], PLACE_M])
@@ -61,8 +61,8 @@ def test_poses_at_several_times_give_pairs_of_homographies(rng: np.random.Genera
     np.testing.assert_allclose(all_at_once[2], scene.chart_from_ray(turns[2], places[2]))
 
 
-def test_things_hung_before_a_scene_hide_some_of_it_and_not_all(rng: np.random.Generator):
-    """The farther plane stays as it was; covered light never exceeds the cover."""
+def test_near_objects_hide_part_of_the_scene(rng: np.random.Generator):
+    """The farther plane is unchanged, and covered light is never above the cover."""
     plane = Scene(chart(rng), FOCAL, FAR_M)
     scene = add_near_objects(plane, rng, depth_m=NEAR_M, focal_px=FOCAL)
     (near,) = scene.nearer
@@ -73,8 +73,8 @@ def test_things_hung_before_a_scene_hide_some_of_it_and_not_all(rng: np.random.G
     assert (near.chart[..., :3].max(axis=2) <= cover + 1e-6).all()
 
 
-def test_things_that_move_go_their_own_ways_and_the_scene_stays(rng: np.random.Generator):
-    """Three planes of objects, in directions a third of a turn apart; at time 0 they are where they were drawn."""
+def test_moving_objects_move_in_three_directions(rng: np.random.Generator):
+    """Three planes of objects move in directions a third of a turn apart, from where they were drawn at time 0."""
     plane = Scene(chart(rng), FOCAL)
     scene = add_moving_objects(plane, rng, speed_px_s=100.0, focal_px=FOCAL)
     drifts = np.array([p.drift_per_s for p in scene.nearer])

@@ -1,4 +1,4 @@
-"""Rows in time, the mean of many instants, and which way the picture moves."""
+"""Times of rows, the mean over many instants, and the direction of picture motion."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ WIDTH, HEIGHT, FOCAL = 120, 90, 100.0
 
 
 def spot_scene(x: float = 0.0, y: float = 0.0, *, depth_m: float = np.inf) -> Scene:
-    """Draw a bright soft spot in direction (x, y, 1) on a dark ground."""
+    """Draw a bright soft spot in direction (x, y, 1) on a dark background."""
     focal = 2 * FOCAL
     rows, columns = np.mgrid[0:801, 0:1001]
     distance = (columns - 500 - focal * x) ** 2 + (rows - 400 - focal * y) ** 2
@@ -38,7 +38,7 @@ def plain_scene(light: float) -> Scene:
 
 
 def camera(**options):
-    """Make a small camera with a principal point off the middle, lying on its side."""
+    """Make a small camera whose principal point is off the middle, lying on its side."""
     profile = nominal_camera(WIDTH, HEIGHT, focal_px=FOCAL, **options)
     return replace(profile, intrinsics=replace(profile.intrinsics, cx_px=57.0, cy_px=47.0))
 
@@ -59,8 +59,8 @@ def centroid_px(light: np.ndarray) -> np.ndarray:
         ("right_to_left", [0.75, 0.5, 0.25, 0.0]),
     ],
 )
-def test_rows_start_as_the_hand_worked_table_says(direction, fractions):
-    """A picture 4 wide and 5 high: rows or columns start at these fractions of the readout."""
+def test_rows_start_at_hand_computed_times(direction, fractions):
+    """In a picture of 4 × 5 pixels, rows or columns start at these fractions of the readout."""
     assert start_fractions(direction, 4, 5) == pytest.approx(fractions)
 
 
@@ -73,7 +73,7 @@ def test_weights_take_the_mean_of_light_that_is_linear_in_time(rng):
     assert weights.T @ instants == pytest.approx(start + 0.0035)
 
 
-def test_an_even_wall_stays_even():
+def test_a_uniform_scene_stays_uniform():
     """The mean over an exposure neither adds nor loses light."""
     profile = camera(readout_direction="left_to_right")
     motion = constant_motion((1.0, -2.0, 3.0))
@@ -81,7 +81,7 @@ def test_an_even_wall_stays_even():
     assert light == pytest.approx(0.37, abs=1e-5)
 
 
-def test_a_camera_at_rest_sees_the_same_as_an_instant():
+def test_an_exposure_at_rest_equals_an_instant():
     """Without motion the exposure is the sharp picture."""
     motion = constant_motion((0.0, 0.0, 0.0))
     view = make_view(camera(), motion)
@@ -92,13 +92,13 @@ def test_a_camera_at_rest_sees_the_same_as_an_instant():
 @pytest.mark.parametrize(
     ("rate", "spot", "moves"),
     [
-        ((0.0, 1.0, 0.0), (0.0, 0.0), (-1, 0)),  # yaw right: picture goes left
-        ((1.0, 0.0, 0.0), (0.0, 0.0), (0, 1)),  # pitch up: picture goes down
-        ((0.0, 0.0, 1.0), (0.25, 0.0), (0, -1)),  # roll clockwise: the right side goes up
+        ((0.0, 1.0, 0.0), (0.0, 0.0), (-1, 0)),  # yaw right: the picture moves left
+        ((1.0, 0.0, 0.0), (0.0, 0.0), (0, 1)),  # pitch up: the picture moves down
+        ((0.0, 0.0, 1.0), (0.25, 0.0), (0, -1)),  # roll clockwise: the right side moves up
     ],
 )
 def test_the_picture_moves_against_the_camera(rate, spot, moves):
-    """Signs of yaw, pitch and roll; camera axes x right, y down, z forward."""
+    """The signs of yaw, pitch and roll are right; camera axes are x right, y down, z forward."""
     motion = constant_motion(rate)
     view, scene = make_view(camera(), motion), spot_scene(*spot)
     shift = centroid_px(instant(scene, motion, view, 0.05)) - centroid_px(instant(scene, motion, view, 0.0))
@@ -106,8 +106,8 @@ def test_the_picture_moves_against_the_camera(rate, spot, moves):
     assert shift == pytest.approx(expected, abs=0.08)
 
 
-def test_moving_right_before_a_plane_shifts_the_picture_left():
-    """A step of 0.1 m to the right at 2 m depth: f · 0.1 / 2 px to the left."""
+def test_moving_right_shifts_the_picture_left():
+    """A step of 0.1 m to the right at 2 m depth shifts the picture by f · 0.1 / 2 px to the left."""
     scene = spot_scene(depth_m=2.0)
     places = []
     for x in (0.0, 0.1):
@@ -116,8 +116,8 @@ def test_moving_right_before_a_plane_shifts_the_picture_left():
     assert places[1] - places[0] == pytest.approx([-5.0, 0.0], abs=0.02)
 
 
-def test_a_tilted_plane_is_seen_where_its_points_are(rng):
-    """Rays through the homography meet the plane at the same chart points as a line and a plane worked out in 3-D."""
+def test_a_tilted_plane_is_seen_at_its_3d_points(rng):
+    """Rays through the homography meet the plane at the chart points of a line and a plane intersected in 3-D."""
     normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
     scene = replace(spot_scene(), depth_m=1.5, normal=tuple(normal))
     position = np.array([0.1, -0.2, 0.15])
@@ -132,7 +132,7 @@ def test_a_tilted_plane_is_seen_where_its_points_are(rng):
 
 
 def test_blur_is_centred_on_the_middle_of_the_row_exposure():
-    """A spot swept by a yaw lies where it was in the middle of its own row's exposure."""
+    """A spot swept by a yaw is centred where it was at the middle of its own row's exposure."""
     profile = camera(readout_time_s=0.02, readout_direction="bottom_to_top")
     motion = constant_motion((0.0, 1.5, 0.0))
     light = expose(spot_scene(), motion, make_view(profile, motion), 0.0, 0.01)
@@ -144,8 +144,8 @@ def test_blur_is_centred_on_the_middle_of_the_row_exposure():
 @pytest.mark.parametrize(
     ("direction", "sign"), [("top_to_bottom", -1), ("bottom_to_top", 1), ("left_to_right", 0), ("right_to_left", 0)]
 )
-def test_rolling_rows_lean_an_upright_line(direction, sign):
-    """Yaw right: what is read later lies further left, so an upright line leans with the row order."""
+def test_a_rolling_shutter_tilts_an_upright_line(direction, sign):
+    """With a yaw to the right, rows read later are further left, so the line leans with the row order."""
     profile = camera(readout_time_s=0.04, readout_direction=direction)
     motion = constant_motion((0.0, 1.0, 0.0))
     chart = np.zeros((801, 1001, 3), np.float32)
@@ -156,8 +156,8 @@ def test_rolling_rows_lean_an_upright_line(direction, sign):
     assert lean == pytest.approx(sign * FOCAL * 1.0 * 0.04 / HEIGHT, abs=1e-3)
 
 
-def test_flicker_brightens_rows_by_its_own_mean_over_their_exposure():
-    """Rows carry the mean of 1 + a sin(2πft + φ) over their exposure, in closed form."""
+def test_flicker_scales_rows_by_its_mean_over_the_exposure():
+    """Each row has the mean of 1 + a sin(2πft + φ) over its exposure, in closed form."""
     profile = replace(
         camera(readout_time_s=0.02, readout_direction="top_to_bottom"),
         extensions=Extensions(flicker_amplitude=0.3, flicker_frequency_hz=120.0, flicker_phase_rad=0.4),
@@ -170,8 +170,8 @@ def test_flicker_brightens_rows_by_its_own_mean_over_their_exposure():
     assert light == pytest.approx(0.5 * (1 + mean), abs=1e-3)
 
 
-def test_a_full_stabiliser_cancels_fast_pitch_and_yaw_but_not_roll():
-    """With fraction 1 and a very low cutoff the middle of the picture stands still."""
+def test_a_full_stabiliser_cancels_fast_pitch_and_yaw():
+    """With a fraction of 1 and a very low cutoff the middle of the picture stays still."""
     profile = replace(camera(), extensions=Extensions(stabilisation_fraction=1.0, stabilisation_cutoff_hz=1e-4))
     motion = constant_motion((0.3, -0.5, 0.0))
     scene = spot_scene()
@@ -191,7 +191,7 @@ def test_the_high_pass_follows_its_closed_form():
 
 
 def test_focal_drift_magnifies_with_time():
-    """f(t) = f (1 + drift · t): a spot off the centre moves outwards in proportion."""
+    """With f(t) = f (1 + drift · t) a spot off the centre moves outwards in proportion."""
     profile = replace(camera(), extensions=Extensions(focal_drift_per_s=0.2))
     motion = constant_motion((0.0, 0.0, 0.0))
     view, scene = make_view(profile, motion), spot_scene(0.3, 0.2)
@@ -201,7 +201,7 @@ def test_focal_drift_magnifies_with_time():
 
 @pytest.mark.parametrize("model", ["radtan", "fisheye"])
 def test_rays_invert_the_lens(model):
-    """Projecting a pixel's ray with OpenCV's (or the written out) distortion gives the pixel again."""
+    """Projecting a pixel's ray with OpenCV's distortion, or the fisheye formula, gives the pixel again."""
     coefficients = (-0.12, 0.03, 0.002, -0.001, 0.01) if model == "radtan" else (0.02, -0.01, 0.003, -0.001)
     lens = Intrinsics(80, 60, 70.0, 72.0, 38.0, 31.0, model, coefficients)
     x, y = (a.astype(float) for a in pixel_rays(lens))
@@ -221,8 +221,8 @@ def test_rays_invert_the_lens(model):
     assert np.abs(found - np.stack([columns, rows], axis=-1)).max() < 1e-3
 
 
-def test_a_scene_that_slides_is_smeared_by_its_own_motion_and_rolls_with_the_rows():
-    """A still camera sees a sliding spot at the middle of its row's exposure, drawn out by speed times exposure."""
+def test_a_sliding_scene_is_blurred_by_its_own_motion():
+    """A still camera sees a sliding spot at the middle of its row's exposure, blurred over speed × exposure."""
     speed_px_s, exposure_s, readout_s = 300.0, 0.02, 0.03
     profile = camera(readout_time_s=readout_s)
     motion = constant_motion((0.0, 0.0, 0.0))

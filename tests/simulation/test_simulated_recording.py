@@ -1,4 +1,4 @@
-"""The folder: what a phone would have written, with stamps, clocks and truth that agree."""
+"""The capture folder: the files of a phone, with consistent timestamps, clocks and truth."""
 
 import json
 
@@ -30,7 +30,7 @@ def luma_of(pictures):
 
 
 def test_the_folder_is_complete(plain_capture):
-    """All files of the app's layout, camera.yaml and truth; nothing half-written."""
+    """It has all files of the app's layout, camera.yaml and truth/, and nothing temporary."""
     assert {path.name for path in plain_capture.iterdir()} == FILES
     assert len(list(plain_capture.parent.iterdir())) == 1
     assert {p.name for p in (plain_capture / "truth").iterdir()} == {
@@ -42,7 +42,7 @@ def test_the_folder_is_complete(plain_capture):
 
 
 def test_the_truth_file_is_strict_json(tmp_path):
-    """Infinities as words, NaN as null, and a text that contains the word left alone."""
+    """Infinities are words and NaN is null; a text that contains the word is unchanged."""
     profile = nominal_camera(32, 32)
     session = plan_session(profile, profile, SessionSettings(frames=1, seed=1))
     odd = {"far": np.inf, "parts": (-np.inf, float("nan"), 1.5), "note": "Infinity"}
@@ -58,8 +58,8 @@ def test_the_truth_file_is_strict_json(tmp_path):
 
 
 @pytest.mark.parametrize("fps", [30.0, 29.94, 60.0])
-def test_movie_stamps_are_the_logged_stamps(fps, simulate):
-    """PTS − stamp differences are below a microsecond."""
+def test_movie_timestamps_are_the_logged_timestamps(fps, simulate):
+    """PTS and timestamps differ by less than a microsecond."""
     folder = simulate("pts", fps=fps)
     _, pts = read_movie(folder)
     stamps = read_stamps(folder)
@@ -69,7 +69,7 @@ def test_movie_stamps_are_the_logged_stamps(fps, simulate):
 
 
 def test_gyro_integrates_to_the_true_trajectory(simulate):
-    """In camera axes, by the exponential of the mean rate of each interval; 1 kHz, over more than a second."""
+    """Samples at 1 kHz, in camera axes, are integrated by the exponential of each interval's mean rate."""
     folder = simulate("gyro", imu_rate_hz=1000.0)
     time_ns, gyro, _ = read_imu(folder)
     r_cam_imu = np.array(read_profile(folder / "camera.yaml").r_cam_imu)
@@ -84,8 +84,8 @@ def test_gyro_integrates_to_the_true_trajectory(simulate):
 
 
 @pytest.mark.parametrize(("width", "height"), [(96, 160), (160, 96)])
-def test_the_files_alone_carry_one_truth_picture_onto_the_next(width, height, simulate):
-    """Gyro, T_cam_imu and K of the files turn picture 1 into picture 3, upright and on its side (K R K⁻¹)."""
+def test_the_files_alone_map_one_truth_picture_to_another(width, height, simulate):
+    """Gyroscope, T_cam_imu and K map picture 1 to picture 3 by K R K⁻¹, upright and on the side."""
     folder = simulate("warp", width=width, height=height, imu_rate_hz=1000.0, noise_levels=0.0, fps=60.0)
     profile = read_profile(folder / "camera.yaml")
     time_ns, gyro, _ = read_imu(folder)
@@ -102,14 +102,14 @@ def test_the_files_alone_carry_one_truth_picture_onto_the_next(width, height, si
 
 
 def test_the_accelerometer_reads_gravity_up(simulate):
-    """About +9.81 along the upright phone's y, and along x for a phone on its side."""
+    """It reads about +9.81 along the y of an upright phone, and along x for a phone on its side."""
     upright = read_imu(simulate("up", rate_rad_s=0.0))[2].mean(axis=0)
     side = read_imu(simulate("side", rate_rad_s=0.0, width=128, height=96))[2].mean(axis=0)
     assert upright == pytest.approx([0, 9.81, 0], abs=1e-6)
     assert side == pytest.approx([9.81, 0, 0], abs=1e-6)
 
 
-def test_imu_surrounds_the_frames(plain_capture):
+def test_imu_samples_surround_the_frames(plain_capture):
     """Samples begin before the first exposure and end after the last."""
     time_ns, _, _ = read_imu(plain_capture)
     stamps = read_stamps(plain_capture)
@@ -117,28 +117,28 @@ def test_imu_surrounds_the_frames(plain_capture):
     assert time_ns[-1] > stamps[-1] + 3e8
 
 
-def test_a_camera_at_rest_films_its_truth(simulate):
-    """Without motion and noise the movie is the truth picture, up to the encoder."""
+def test_a_movie_at_rest_equals_the_truth(simulate):
+    """Without motion and noise the movie is the truth picture, apart from coding."""
     folder = simulate("rest", rate_rad_s=0.0, noise_levels=0.0, crf=4, width=160, height=96)
     movie, truth = read_movie(folder)[0].astype(float), luma_of(read_truth(folder))
     assert np.abs(movie - truth).mean() < 0.8
     assert abs((movie - truth).mean()) < 0.1
 
 
-def test_a_moving_camera_is_blurred_and_its_truth_is_not(plain_capture):
+def test_the_movie_is_blurred_and_the_truth_is_sharp(plain_capture):
     """The truth has more gradient energy than the movie."""
     movie, truth = read_movie(plain_capture)[0].astype(float), luma_of(read_truth(plain_capture))
     assert (np.diff(truth, axis=2) ** 2).mean() > 1.3 * (np.diff(movie, axis=2) ** 2).mean()
 
 
-def test_the_middle_truth_is_another_instant(simulate):
-    """``--reference frame-middle`` adds pictures of the readout's and exposure's middle."""
+def test_the_frame_middle_truth_is_another_instant(simulate):
+    """``--reference frame-middle`` adds pictures of the middle of readout and exposure."""
     folder = simulate("middle", reference="frame-middle")
     assert np.abs(read_truth(folder, "frame_middle") - read_truth(folder)).mean() > 1.0
 
 
 def test_the_release_layout_has_no_unix_columns(plain_capture, simulate):
-    """The header of v2.0 has 7 columns with spaces, the 2021 one 8 without."""
+    """Version 2.0 has 7 columns and spaces in the header; the layout of 2021 has 8 and no spaces."""
     old = simulate("old", layout="v2.0")
     assert (old / "gyro_accel.csv").read_text().splitlines()[0] == (
         "Timestamp[nanosec], gx[rad/s], gy[rad/s], gz[rad/s], ax[m/s^2], ay[m/s^2], az[m/s^2]"
@@ -148,8 +148,8 @@ def test_the_release_layout_has_no_unix_columns(plain_capture, simulate):
     assert (plain_capture / "gyro_accel.csv").read_text().splitlines()[0].endswith(",az[m/s^2],Unix time[nanosec]")
 
 
-def test_an_unknown_camera_clock_is_brought_back_by_edge_epochs(plain_capture, simulate):
-    """Stamps + the mean of the two differences are the stamps of the REALTIME capture."""
+def test_edge_epochs_relate_an_unknown_camera_clock(plain_capture, simulate):
+    """Timestamps plus the mean of both differences equal those of the REALTIME capture."""
     folder = simulate("unknown", clock="UNKNOWN")
     rows = [line.split("\t") for line in (folder / "edge_epochs.txt").read_text().splitlines() if line[0] != "#"]
     shift = sum(int(row[2]) for row in rows) // 2
@@ -159,7 +159,7 @@ def test_an_unknown_camera_clock_is_brought_back_by_edge_epochs(plain_capture, s
 
 
 def test_the_same_seed_gives_the_same_files(plain_capture, simulate):
-    """Byte for byte; another seed gives others."""
+    """All files have the same bytes; another seed gives another movie."""
     again, other = simulate("again"), simulate("other", seed=4)
     for path in (p.relative_to(again) for p in again.rglob("*") if p.is_file()):
         assert (again / path).read_bytes() == (plain_capture / path).read_bytes(), path
@@ -167,7 +167,7 @@ def test_the_same_seed_gives_the_same_files(plain_capture, simulate):
 
 
 def test_changing_exposures_are_logged_and_used(simulate):
-    """Frames take the exposures in turn; exposure times ISO stays."""
+    """Frames use the exposures in turn, and exposure × ISO is constant."""
     folder = simulate("turns", exposure_ms=[4.0, 8.0])
     rows = [line.split(",") for line in (folder / "movie_metadata.csv").read_text().splitlines()[1:]]
     assert [row[4] for row in rows] == ["4000000", "8000000", "4000000", "8000000", "4000000"]
@@ -176,8 +176,8 @@ def test_changing_exposures_are_logged_and_used(simulate):
     assert [slot["exposure_s"] for slot in told["slots"]][:2] == [0.004, 0.008]
 
 
-def test_an_existing_folder_is_refused_and_overwritten_on_demand(simulate):
-    """Exit code 8 and a hint; --overwrite replaces a simulated capture, and nothing else."""
+def test_an_existing_folder_is_refused_without_overwrite(simulate):
+    """An output error says so; --overwrite replaces a simulated capture and nothing else."""
     folder = simulate("there")
     with pytest.raises(OutputError, match="not empty"):
         simulate("there")
@@ -187,8 +187,8 @@ def test_an_existing_folder_is_refused_and_overwritten_on_demand(simulate):
         simulate("there", overwrite=True)
 
 
-def test_a_failure_half_way_leaves_nothing(simulate, tmp_path, monkeypatch):
-    """The folder appears whole or not at all."""
+def test_an_interrupted_simulation_leaves_no_folder(simulate, tmp_path, monkeypatch):
+    """The folder appears complete or not at all."""
 
     def break_down(*_):
         raise KeyboardInterrupt
@@ -229,22 +229,22 @@ def test_odd_sizes_are_refused(simulate):
         ({"effects": ["defocus=-1"]}, "sigma_px"),
     ],
 )
-def test_sizes_that_no_camera_has_are_refused_in_one_line(simulate, asked, said):
-    """Neither a fault deep in the renderer, nor a picture of nothing, nor arrays without end."""
+def test_impossible_settings_are_refused(simulate, asked, said):
+    """The settings error names the quantity, instead of a fault in the renderer, an empty picture or huge arrays."""
     with pytest.raises(SettingsError, match=said):
         simulate("impossible", **asked)
 
 
 @pytest.mark.parametrize("scene", ["colours", "bright", "board", "text", "photographs"])
-def test_every_scene_can_be_filmed(scene, simulate):
-    """Each kind gives pictures with contrast; the bright one clips a few percent."""
+def test_every_scene_can_be_simulated(scene, simulate):
+    """Each kind has contrast, and only the bright one clips a few per cent of the picture."""
     truth = read_truth(simulate(scene, scene=scene, frames=1, depth_m=1.2, tilt_deg=(10.0, -5.0)))
     assert truth.std() > 20
     assert (0.005 < (truth == 255).mean() < 0.15) == (scene == "bright")
 
 
-def test_known_colours_keep_their_place_in_yuv():
-    """BT.601 limited range: grey 128 → Y 126; pure red → 81, 90, 240."""
+def test_known_colours_have_known_yuv_values():
+    """In BT.601 limited range grey 128 has Y 126, and pure red is 81, 90, 240."""
     picture = np.zeros((4, 8, 3), np.uint8)
     picture[...] = 128
     assert set(np.unique(yuv_planes(picture)[:4])) == {126}
@@ -253,8 +253,8 @@ def test_known_colours_keep_their_place_in_yuv():
     assert (planes[0], planes[32], planes[40]) == (81, 90, 240)
 
 
-def test_chroma_sits_on_the_left_luma_column():
-    """A step of colour between columns 3 and 4 reaches the chroma sample of column 4 with weight 3/4."""
+def test_chroma_is_sampled_at_the_left_luma_column():
+    """A step of colour between columns 3 and 4 reaches the chroma sample of column 4 with a weight of 3/4."""
     picture = np.zeros((2, 8, 3), np.uint8)
     picture[:, 4:] = (0, 0, 255)
     chroma = yuv_planes(picture).ravel()[16:20].astype(float) - 128

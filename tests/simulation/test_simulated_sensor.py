@@ -1,4 +1,4 @@
-"""From light to grey, against numbers worked by hand."""
+"""From light to grey levels, against values computed by hand."""
 
 from dataclasses import replace
 
@@ -25,25 +25,25 @@ FIVE = ResponseCurve("five_segment", b=(0.2, 0.1), c=(0.6, 0.7), y_max=0.9)
         (2.0, 0.9),
     ],
 )
-def test_the_five_segments_pass_through_hand_worked_points(light, grey):
-    """A, B, C, D and the middles of toe and shoulder."""
+def test_the_five_segments_pass_through_hand_computed_points(light, grey):
+    """The points are A, B, C, D and the middles of toe and shoulder."""
     assert grey_of_light(np.array([light], np.float32), FIVE)[0] == pytest.approx(grey, abs=1e-5)
 
 
-def test_gamma_and_black_level_come_after_the_curve():
+def test_gamma_and_black_level_apply_after_the_curve():
     """Grey = black + (1 − black) curve^gamma: 0.1 + 0.9 · 0.25² = 0.15625."""
     curve = ResponseCurve("linear", extra_gamma=2.0, black_level=0.1)
     assert grey_of_light(np.array([0.25, 0.0], np.float32), curve) == pytest.approx([0.15625, 0.1], abs=1e-6)
 
 
 def test_srgb_of_middle_grey():
-    """IEC 61966-2-1: linear 0.18 is 0.4614, 0.002 is 0.02584."""
+    """In IEC 61966-2-1, linear 0.18 is 0.4614 and 0.002 is 0.02584."""
     grey = grey_of_light(np.array([0.18, 0.002], np.float32), ResponseCurve("srgb"))
     assert grey == pytest.approx([0.46136, 0.02584], abs=1e-4)
 
 
-def test_vignetting_takes_its_loss_at_the_corner_and_nothing_in_the_middle():
-    """1 − loss (r / r_corner)², r_corner half the diagonal; then the gain."""
+def test_vignetting_grows_from_the_middle_to_the_corner():
+    """The factor is 1 − loss (r / r_corner)², with r_corner half the diagonal, times the gain."""
     profile = replace(nominal_camera(40, 60), extensions=Extensions(vignetting_corner_loss=0.4))
     light = sensor_light(np.ones((60, 40, 3), np.float32), profile, 1.5, defocus=True)
     assert light[30, 20] == pytest.approx(1.5, abs=1e-3)
@@ -61,8 +61,8 @@ def test_defocus_spreads_a_point_by_its_sigma():
     assert (spread.sum(axis=0) * (np.arange(60) - 30) ** 2).sum() == pytest.approx(1.7**2, rel=0.02)
 
 
-def test_noise_has_its_size_and_no_bias(rng):
-    """A grey of 100.5 levels with noise of 2 levels."""
+def test_noise_has_the_given_size_and_no_bias(rng):
+    """A grey of 100.5 levels has noise of 2 levels plus rounding."""
     picture = eight_bit(np.full((300, 300, 3), 100.5 / 255, np.float32), 2.0, rng).astype(float)
     assert picture.mean() == pytest.approx(100.5, abs=0.05)
     assert picture.std() == pytest.approx(np.hypot(2.0, np.sqrt(1 / 12)), rel=0.03)

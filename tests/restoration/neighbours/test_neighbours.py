@@ -1,4 +1,4 @@
-"""Frames and their neighbours: where the picture really moved, what deblurring gains, and frames restored together."""
+"""Frames and their neighbours: the true motion between them, the gain of deblurring, and joint restoration."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +24,7 @@ SIZE = {"width": 320, "height": 384, "focal_px": 350.0, "exposure_ms": 14.0, "ra
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., TrueCapture]:
-    """A small shaken capture with truth; options as simulate_command takes them, and ``config``."""
+    """Simulate a small shaken capture with truth; options are those of simulate_command, and ``config``."""
     made: dict[str, Path] = {}
 
     def make(config: bool = False, **options: object) -> TrueCapture:
@@ -39,7 +39,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., TrueCap
 
 
 def _gains(capture: TrueCapture, plan: RestorationPlan) -> np.ndarray:
-    """PSNR of each frame by a plan over straightening alone by the same plan."""
+    """PSNR of each frame with a plan, minus that of straightening alone with the same plan."""
     alone = replace(plan, settings=replace(plan.settings, deblur="none"))
     base = {r.frame.index: r for r in capture.restored(alone)}
     found = []
@@ -50,8 +50,8 @@ def _gains(capture: TrueCapture, plan: RestorationPlan) -> np.ndarray:
     return np.array(found)
 
 
-def test_a_turn_that_the_profile_lacks_is_measured_between_two_frames(simulated):
-    """An added turn rate comes back with its sign, within four deviations, from frames that are blurred."""
+def test_a_missing_turn_is_measured_between_two_frames(simulated):
+    """An added turn rate is found with its sign within four standard deviations, although the frames are blurred."""
     capture = simulated()
     plan = capture.plan(replace(PRESETS["fast"], deblur="none"))
     motions, pictures = capture.motions(plan), dict(capture.recorded())
@@ -72,13 +72,13 @@ def test_a_turn_that_the_profile_lacks_is_measured_between_two_frames(simulated)
     assert np.all(deviations < 0.05)
 
 
-def test_a_right_prediction_is_left_as_it_is(simulated):
+def test_a_correct_prediction_is_not_changed(simulated):
     """Where neighbours agree with the gyroscope nothing is corrected."""
     assert simulated().plan(PRESETS["fast"]).missing_turn is None
 
 
-def test_lamps_in_every_tile_leave_the_rest_to_judge_by(simulated):
-    """Neighbours confirm deblurring though no tile is free of clipped light."""
+def test_clipped_highlights_in_every_tile_allow_confirmation(simulated):
+    """Neighbours confirm deblurring although no tile is free of clipped light."""
     confirmed = simulated(scene="bright").plan(PRESETS["fast"]).confirmed
     assert confirmed is not None
     assert confirmed.share > 0.5
@@ -91,7 +91,7 @@ def test_lamps_in_every_tile_leave_the_rest_to_judge_by(simulated):
     ids=["offset", "processed"],
 )
 def test_frames_are_corrected_by_their_neighbours(simulated, isp):
-    """What no profile says spoils no frame, and deblurring gains where it would lose as predicted."""
+    """Errors missing from the profile spoil no frame, and corrected frames gain 0.3 dB over uncorrected ones."""
     capture = simulated(isp=isp)
     plan = capture.plan(PRESETS["balanced"])
     assert plan.missing_turn is not None
@@ -103,7 +103,7 @@ def test_frames_are_corrected_by_their_neighbours(simulated, isp):
 
 @pytest.mark.scenario
 def test_frames_restored_together_are_better_than_each_alone(simulated):
-    """Neighbours blurred along other paths bring back what a frame's own path cancels; none makes a frame worse."""
+    """Neighbours blurred along other paths restore what a frame's own path cancels, and make no frame worse."""
     capture = simulated()
     plan = capture.plan(PRESETS["balanced"])
     single = _gains(capture, replace(plan, settings=replace(plan.settings, neighbours=0)))
@@ -115,7 +115,7 @@ def test_frames_restored_together_are_better_than_each_alone(simulated):
 
 
 def test_a_frame_that_is_expected_to_lose_is_only_straightened(simulated, monkeypatch):
-    """Where the places of rows make sharp edges worse than blurred ones, the frame is left blurred, and says so."""
+    """A predicted loss of 0.3 dB leaves the frame blurred, with a warning of a gain of only 0.00 dB."""
     capture = simulated()
     plan = replace(capture.plan(PRESETS["fast"]), confirmed=ConfirmedGain(1.0, 0.2, 0.02, 4))
     straight = next(capture.restored(replace(plan, settings=replace(plan.settings, deblur="none"))))
@@ -130,8 +130,8 @@ def test_a_frame_that_is_expected_to_lose_is_only_straightened(simulated, monkey
 @pytest.mark.parametrize(
     ("predicted_db", "deblurred"), [(LEAST_CONFIRMED_DB - 0.01, False), (LEAST_CONFIRMED_DB, True)]
 )
-def test_a_prediction_within_its_own_error_is_not_acted_on(simulated, monkeypatch, predicted_db, deblurred):
-    """Half the predictions are off by more than the least one for which a frame is deblurred."""
+def test_only_gains_above_a_minimum_are_acted_on(simulated, monkeypatch, predicted_db, deblurred):
+    """Frames with a predicted gain below the minimum are not deblurred and have a warning."""
     capture = simulated()
     plan = replace(capture.plan(PRESETS["fast"]), confirmed=ConfirmedGain(1.0, 0.2, 0.02, 4))
     monkeypatch.setattr(ConfirmedGain, "of_change_db", lambda *_: (predicted_db, 0.2))
@@ -141,8 +141,8 @@ def test_a_prediction_within_its_own_error_is_not_acted_on(simulated, monkeypatc
     assert any("expected to gain only 0.49 dB" in warning for warning in found.warnings) != deblurred
 
 
-def test_colour_is_restored_together_too(simulated):
-    """What neighbours bring to the colour differences comes on top of what they bring to the luma."""
+def test_chroma_is_restored_jointly(simulated):
+    """Joining neighbours for chroma lowers its error by 5 % or more beyond the joint luma."""
     capture = simulated(rate_rad_s=2.4, bitrate_bits_per_px=2.0)
     plan = replace(capture.plan(PRESETS["best"]), confirmed=None)
 
@@ -163,7 +163,7 @@ def test_colour_is_restored_together_too(simulated):
 
 
 def test_a_neighbour_that_shows_something_else_is_left_out(simulated):
-    """A picture of another scene in a neighbour's place takes nothing away from the frame."""
+    """A picture of another scene in place of a neighbour does not lower the quality of the frame."""
     capture = simulated()
     plan = replace(capture.plan(PRESETS["balanced"]), confirmed=None)
     frames = list(capture.recorded())
@@ -176,8 +176,8 @@ def test_a_neighbour_that_shows_something_else_is_left_out(simulated):
 
 
 @pytest.mark.parametrize("number", [3, 4], ids=["last before", "first after"])
-def test_a_scene_cut_takes_nothing_away(simulated, number):
-    """The frames beside a cut are as good as from their own side of it, or as each alone."""
+def test_a_scene_cut_does_no_harm(simulated, number):
+    """Frames beside a cut are as good as from frames of the same scene, or as from themselves alone."""
     capture = simulated()
     plan = replace(capture.plan(PRESETS["balanced"]), confirmed=None)
     frames = list(capture.recorded())
@@ -192,8 +192,8 @@ def test_a_scene_cut_takes_nothing_away(simulated, number):
 
 
 @pytest.mark.scenario
-def test_things_that_move_are_not_made_worse(simulated):
-    """Their blur is not the camera's: they stay as recorded, and what stands still gains by neighbours."""
+def test_moving_objects_do_not_become_worse(simulated):
+    """Their blur is not the camera's: they stay as recorded, and the static scene still gains from neighbours."""
     capture = simulated(moving_px_s=240.0)
     plan = replace(capture.plan(PRESETS["balanced"]), confirmed=None)
     joint = _gains(capture, plan)
@@ -206,8 +206,8 @@ def test_things_that_move_are_not_made_worse(simulated):
     assert joint.mean() > max(single.mean() + 0.3, all_taken.mean())
 
 
-def test_a_frame_does_not_depend_on_how_the_movie_is_cut(simulated):
-    """The bytes of a frame are the same from the whole movie and from its neighbours alone."""
+def test_a_frame_does_not_depend_on_the_rest_of_the_movie(simulated):
+    """Its bytes are the same from the whole movie and from its neighbours alone."""
     capture = simulated()
     plan = capture.plan(PRESETS["balanced"])
     frames = list(capture.recorded())
@@ -219,8 +219,8 @@ def test_a_frame_does_not_depend_on_how_the_movie_is_cut(simulated):
     assert part[0].parameters["deblur"] == whole[number].parameters["deblur"]
 
 
-def test_a_promise_that_no_neighbour_confirms_is_null(simulated):
-    """A single picture has no confirmed gain; a movie's frames have one with its deviation."""
+def test_an_unconfirmed_gain_is_null(simulated):
+    """Without confirmation the gain is null; with it every deblurred frame has a gain and a deviation."""
     capture = simulated()
     plan = capture.plan(PRESETS["fast"])
     confirmed = [r.parameters["deblur"] for r in capture.restored(plan)]
@@ -231,8 +231,8 @@ def test_a_promise_that_no_neighbour_confirms_is_null(simulated):
     assert all(d["expected_gain_db"] is None for d in alone if d["method"] != "none")
 
 
-def test_nothing_is_deblurred_where_neighbours_see_no_gain(simulated):
-    """A share of nothing leaves every frame undeblurred, and the log gives the figure."""
+def test_nothing_is_deblurred_if_neighbours_see_no_gain(simulated):
+    """A share of 0 leaves every frame undeblurred, and the log gives the expected gain."""
     capture = simulated()
     plan = capture.plan(PRESETS["fast"])
     assert plan.confirmed is not None
@@ -242,8 +242,8 @@ def test_nothing_is_deblurred_where_neighbours_see_no_gain(simulated):
 
 
 @pytest.mark.parametrize("reach", [0, 1, 3])
-def test_each_frame_comes_once_with_those_around_it(reach):
-    """Windows are cut at both ends and lose no frame."""
+def test_each_frame_comes_once_with_its_neighbours(reach):
+    """Windows are cut at both ends and miss no frame."""
     sights = [Sight(None, np.zeros((k + 1, 1), np.uint8), None) for k in range(6)]  # type: ignore[arg-type]
     seen = [([len(s.picture) for s in b], len(h.picture), [len(s.picture) for s in a])
             for b, h, a in with_neighbours(sights, reach)]  # fmt: skip
@@ -255,7 +255,7 @@ def test_each_frame_comes_once_with_those_around_it(reach):
 @pytest.mark.scenario
 @pytest.mark.parametrize(("rate", "exposure_ms"), [(0.3, 5.0), (1.5, 8.0)], ids=["gentle", "fast"])
 def test_a_known_defocus_never_spoils_a_frame(simulated, rate, exposure_ms):
-    """A Gaussian passes next to nothing at high frequencies: what is recorded there is no picture (once: -20 dB)."""
+    """A Gaussian passes hardly anything at high frequencies, where the recorded values are noise."""
     capture = simulated(True, effects=["defocus=1.8"], rate_rad_s=rate, exposure_ms=exposure_ms)
     gains = _gains(capture, capture.plan(replace(PRESETS["balanced"], neighbours=0)))
     assert gains.min() > -0.1
@@ -263,8 +263,8 @@ def test_a_known_defocus_never_spoils_a_frame(simulated, rate, exposure_ms):
 
 
 @pytest.mark.scenario
-def test_a_blur_longer_than_a_measured_tile_is_undone(simulated):
-    """Paths of 100 px and more in a large picture are measured at a smaller size, and restored (once: given up)."""
+def test_a_blur_longer_than_a_tile_is_undone(simulated):
+    """Paths of 100 px and more in a large picture are measured at a reduced size and restored."""
     capture = simulated(width=480, height=400, focal_px=700.0, rate_rad_s=6.0, exposure_ms=30.0, frames=3)
     settings = replace(PRESETS["fast"], min_blur_px=1.0)
     plan = replace(capture.plan(settings), confirmed=None, refusal=None)

@@ -1,4 +1,4 @@
-"""What of the turn that a prediction lacks is constant or follows from the predicted one."""
+"""The part of a missing turn rate that is constant or follows from the predicted rate."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FREQUENCY_HZ, PHASE_RAD = np.array([3.1, 4.3, 5.7]), np.array([0.3, 1.7, 2.9])
 
 
 class _Waving(Trajectory):
-    """A turn rate that is known in closed form."""
+    """A turn rate in closed form."""
 
     def __init__(self) -> None:
         pass
@@ -42,7 +42,7 @@ class _Waving(Trajectory):
 
 
 def _turns(lag_s: float, part: float, noise: float, rng: np.random.Generator) -> list[PairTurn]:
-    """Twelve pairs of frames of a camera whose turn is later, and by a part larger, than predicted."""
+    """Twelve pairs of frames of a camera whose turn lags behind the predicted one and is larger by a fraction."""
     found = []
     for start_s in PERIOD_S * np.arange(12):
         instants_s = np.linspace(start_s, start_s + PERIOD_S, 400)
@@ -54,8 +54,8 @@ def _turns(lag_s: float, part: float, noise: float, rng: np.random.Generator) ->
 
 
 @pytest.mark.parametrize(("lag_s", "part"), [(0.002, 0.0), (-0.001, 0.08), (0.0, -0.1)])
-def test_a_lag_and_a_scale_come_back(rng: np.random.Generator, lag_s: float, part: float) -> None:
-    """Both are found from a few noisy pairs, and what they leave of these is their noise."""
+def test_a_lag_and_a_scale_are_found(rng: np.random.Generator, lag_s: float, part: float) -> None:
+    """Both are found from a few noisy pairs, and the residual of the pairs is their noise."""
     turns, waving = _turns(lag_s, part, 0.005, rng), _Waving()
     found = following_turn(turns, waving)
     assert found.lag_s == pytest.approx(lag_s, abs=3e-4)
@@ -67,16 +67,16 @@ def test_a_lag_and_a_scale_come_back(rng: np.random.Generator, lag_s: float, par
     )
 
 
-def test_turns_that_follow_nothing_are_not_explained(rng: np.random.Generator) -> None:
-    """Of turns that are unrelated to the predicted rate next to nothing is put down to it."""
+def test_unrelated_turns_are_not_explained(rng: np.random.Generator) -> None:
+    """Hardly any of a turn unrelated to the predicted rate is attributed to it."""
     found = following_turn(_turns(0.0, 0.0, 0.05, rng), _Waving())
     assert abs(found.lag_s) < 1.5e-3
     assert abs(found.part) < 0.03
     assert FollowingTurn().residual_of(_turns(0.0, 0.0, 0.05, rng)[0], _Waving()).rate_rad_s.any()
 
 
-def test_a_rest_that_interpolation_tells_better_follows_nothing(rng: np.random.Generator) -> None:
-    """A slow turn that is unrelated to the predicted rate is left to interpolation; a lag is not."""
+def test_a_slow_unrelated_turn_is_left_to_interpolation(rng: np.random.Generator) -> None:
+    """A slow turn unrelated to the predicted rate is left to interpolation; a lag is corrected."""
     slow = [
         replace(turn, rate_rad_s=turn.rate_rad_s + 0.2 * np.sin(2 * np.pi * 0.8 * turn.start_s + PHASE_RAD))
         for turn in _turns(0.0, 0.0, 0.002, rng)
@@ -89,12 +89,12 @@ def test_a_rest_that_interpolation_tells_better_follows_nothing(rng: np.random.G
 
 
 def _biased(turns: list[PairTurn], bias_rad_s: tuple[float, float, float] = BIAS_RAD_S) -> list[PairTurn]:
-    """The pairs of a camera whose gyroscope reads too little by a constant."""
+    """The pairs of a camera whose gyroscope reads a constant too low."""
     return [replace(turn, rate_rad_s=turn.rate_rad_s + bias_rad_s) for turn in turns]
 
 
-def test_a_bias_comes_back_beside_a_lag_and_a_scale(rng: np.random.Generator) -> None:
-    """Each within what twelve pairs of 2 mrad/s determine."""
+def test_a_bias_is_found_beside_a_lag_and_a_scale(rng: np.random.Generator) -> None:
+    """Each is found with the precision of twelve pairs of 2 mrad/s."""
     found = accepted_turn([_biased(_turns(0.003, -0.08, 0.002, rng))], _Waving())[0]
     assert found.bias_rad_s == pytest.approx(BIAS_RAD_S, abs=0.003)
     assert found.lag_s == pytest.approx(0.003, abs=3e-4)
@@ -104,8 +104,8 @@ def test_a_bias_comes_back_beside_a_lag_and_a_scale(rng: np.random.Generator) ->
     )
 
 
-def test_a_passing_bus_does_not_move_the_bias(rng: np.random.Generator) -> None:
-    """A bias is a median, which a quarter of the pairs does not spoil."""
+def test_a_quarter_of_outlier_pairs_does_not_change_the_bias(rng: np.random.Generator) -> None:
+    """The bias is a median, which a quarter of the pairs cannot spoil."""
     turns = [
         replace(turn, rate_rad_s=turn.rate_rad_s + 0.3 * (k % 4 == 0))
         for k, turn in enumerate(_biased(_turns(0.0, 0.0, 0.002, rng)))
@@ -114,8 +114,8 @@ def test_a_passing_bus_does_not_move_the_bias(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(("scatter", "believed"), [(1.2, True), (4.0, False)])
-def test_a_large_turn_is_the_camera_s_if_the_tiles_agree_on_it(scatter: float, *, believed: bool) -> None:
-    """It is then added whole; if the tiles scatter, something else moves, and the frame is as uncertain as any."""
+def test_a_large_turn_is_added_if_the_tiles_agree(scatter: float, *, believed: bool) -> None:
+    """If the tiles scatter, something else moves, and the turn is not added."""
     camera, usual = TurningCamera(phone(), exposure_s=0.02), 0.005
     missing = MissingTurn(usual, usual, 0.0, 1.0, 12)
     rate = np.array([0.08, -0.05, 0.02])
@@ -133,19 +133,19 @@ def test_a_large_turn_is_the_camera_s_if_the_tiles_agree_on_it(scatter: float, *
 
 @pytest.mark.parametrize("count", [3, 12])
 def test_noise_is_not_taken_for_a_bias(rng: np.random.Generator, count: int) -> None:
-    """Pairs that scatter by 0.1 rad/s about 0, few or many, show none."""
+    """Few or many pairs that scatter by 0.1 rad/s around 0 give no bias."""
     turns = _turns(0.0, 0.0, 0.1, rng)[:count]
     assert with_bias(FollowingTurn(), turns, _Waving()) == FollowingTurn()
 
 
-def test_parallax_of_a_near_scene_is_no_bias(rng: np.random.Generator) -> None:
-    """A missing rate of 80 mrad/s that three pairs share is beyond any gyroscope's bias."""
+def test_the_parallax_of_a_near_scene_is_not_a_bias(rng: np.random.Generator) -> None:
+    """A missing rate of 80 mrad/s shared by three pairs is larger than any gyroscope's bias."""
     turns = _biased(_turns(0.0, 0.0, 0.002, rng)[:3], (0.08, 0.02, 0.0))
     assert with_bias(FollowingTurn(), turns, _Waving()) == FollowingTurn()
 
 
-def test_rows_are_corrected_though_the_blur_hardly_changes(rng: np.random.Generator) -> None:
-    """At 1 ms of exposure a missing rate displaces rows that are read over 21 ms; without a readout nothing does."""
+def test_rows_are_corrected_even_if_the_blur_hardly_changes(rng: np.random.Generator) -> None:
+    """With 1 ms of exposure a missing rate shifts rows read over 21 ms; without a readout nothing is corrected."""
     camera = TurningCamera(phone(), exposure_s=0.001)
     blind = TurningCamera(replace(camera.profile, readout_known=False), exposure_s=0.001)
     turns = _biased(_turns(0.0, 0.0, 0.002, rng), (0.02, 0.0, 0.0))
@@ -155,8 +155,8 @@ def test_rows_are_corrected_though_the_blur_hardly_changes(rng: np.random.Genera
     assert missing_turn([turns], [blind.motion], _Waving()) is None
 
 
-def test_rows_lie_off_by_what_is_unknown_of_the_speed() -> None:
-    """Over rows read long after the restored instant an unknown speed carries them further than over the exposure."""
+def test_position_uncertainty_follows_from_speed_uncertainty() -> None:
+    """Rows read long after the restored instant are displaced further than over the exposure."""
     motion = TurningCamera(phone()).motion
     refined = RefinedMotion(motion, np.zeros((3, 3)), scatter_px_s=30.0)
     along = np.linspace(0, 1, 2001)[:, None] * [motion.profile.width - 1, motion.profile.height - 1]
@@ -168,8 +168,8 @@ def test_rows_lie_off_by_what_is_unknown_of_the_speed() -> None:
 
 
 @pytest.mark.parametrize("missing_rad_s", [0.0, 0.001, 0.003])
-def test_what_pairs_do_not_exclude_holds_what_is_missing(rng: np.random.Generator, missing_rad_s: float) -> None:
-    """Two deviations hold what is missing 19 times of 20, and the deviation falls with the number of pairs."""
+def test_the_undetected_rate_covers_the_missing_rate(rng: np.random.Generator, missing_rad_s: float) -> None:
+    """Two standard deviations cover the missing rate 19 times of 20, and fall with the number of pairs."""
     noise = 0.005
     few, many = (
         np.array([undetected_rad_s([_scattered(pairs, missing_rad_s, noise, rng)]) for _ in range(200)])
@@ -184,7 +184,7 @@ def test_what_pairs_do_not_exclude_holds_what_is_missing(rng: np.random.Generato
 
 
 def _scattered(pairs: int, missing_rad_s: float, noise: float, rng: np.random.Generator) -> list[PairTurn]:
-    """Pairs that lack independent rates."""
+    """Pairs with independent missing rates."""
     rates = rng.normal(0, np.hypot(noise, missing_rad_s), (pairs, 3))
     return [
         PairTurn(k * PERIOD_S, (k + 1) * PERIOD_S, rate, noise**2 * np.eye(3), 1.0, 12) for k, rate in enumerate(rates)

@@ -1,4 +1,4 @@
-"""Which frames planning compares with their neighbours."""
+"""The frames that planning compares with their neighbours."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from virest.restoration.settings import PRESETS
 
 @pytest.mark.parametrize("count", [14, 31, 60, 240])
 def test_runs_are_spread_over_a_capture_of_any_length(rng: np.random.Generator, count: int) -> None:
-    """An unbroken capture gives as many runs as one of many stretches: one run of fast frames may show nothing."""
+    """An unbroken capture gives as many runs as one with gaps, since one run of fast frames may show nothing."""
     path_px = dict(enumerate(rng.uniform(1, 30, count).tolist()))
     runs = survey_runs(path_px, path_px)
     assert len(runs) == min(count // RUN_FRAMES, MOST_RUNS)
@@ -31,7 +31,7 @@ def test_runs_are_spread_over_a_capture_of_any_length(rng: np.random.Generator, 
 
 
 def test_the_most_blurred_frames_of_each_part_are_compared() -> None:
-    """And no run reaches over a gap between stretches."""
+    """No run extends over a gap between stretches."""
     numbers = [*range(8), *range(20, 28)]
     path_px = {n: 20.0 if 2 <= n <= 5 or n >= 24 else 1.0 for n in numbers}
     runs = survey_runs(numbers, path_px)
@@ -40,10 +40,10 @@ def test_the_most_blurred_frames_of_each_part_are_compared() -> None:
 
 
 @pytest.mark.parametrize("off_rad_s", [None, 0.1])
-def test_points_that_lie_off_count_where_no_pair_of_frames_shows_the_turn(
+def test_a_point_residual_replaces_a_missing_pair_of_frames(
     tmp_path: Path, rng: np.random.Generator, off_rad_s: float | None
 ) -> None:
-    """Noise shows nothing; the turn that the points lack then makes every path uncertain, and nothing else."""
+    """Noise gives no turn; the rate missing from the points then makes every path uncertain, and nothing else."""
     simulate_command(tmp_path / "noise", width=320, height=240, frames=6, rate_rad_s=1.0, truth_frames=False)
     capture = read_capture(tmp_path / "noise")
     profile, _ = resolve_profile(capture, None)
