@@ -32,7 +32,7 @@ def test_names_of_four_kilobytes_are_refused(capfd: pytest.CaptureFixture[str], 
 
 @pytest.mark.parametrize("name", ["a\nb", "a\x1b[2Jb", "a\x7f", "a\x9bb", "a\u2028b"])
 def test_control_characters_are_refused(capfd: pytest.CaptureFixture[str], tmp_path: Path, name: str) -> None:
-    """They could manipulate the terminal of whoever reads the log."""
+    """They could manipulate the terminal of a user who reads the log."""
     (tmp_path / name).mkdir()
     code, line = refused(capfd, tmp_path / name, "--out", tmp_path / "out")
     assert code == 8

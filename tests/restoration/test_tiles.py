@@ -217,7 +217,10 @@ def test_a_bridge_may_be_longer_than_the_margins() -> None:
 
 
 def _lamp_behind_a_blur() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """A lamp of 12 times full light in a dim scene: the sharp scene, the scene blurred by a stroke, and the kernel."""
+    """A dim scene with a highlight of 12 times full light.
+
+    The sharp scene, the scene blurred by a stroke, and the kernel.
+    """
     sharp = (0.1 + 0.2 * texture(150, 210)).astype(np.float32)
     sharp[70:76, 101:109] = 12.0
     kernel = np.zeros((17, 17), np.float32)
@@ -244,8 +247,8 @@ def _filtered_with_lamps(deconvolution: TileDeconvolution, recorded: NDArray[np.
     )
 
 
-def test_a_lamp_is_recovered_from_its_clipped_streak() -> None:
-    """Inside the clipped streak, the lamp and the dark beside it are recovered; other tiles are filtered as usual."""
+def test_a_highlight_is_recovered_from_its_clipped_streak() -> None:
+    """The highlight and the dark beside it are recovered from the clipped streak; other tiles are filtered as usual."""
     sharp, blurred, kernel = _lamp_behind_a_blur()
     recorded = np.minimum(blurred, 1)
     deconvolution, numbers = _with_lamp_tamed(recorded, kernel)
@@ -254,13 +257,13 @@ def test_a_lamp_is_recovered_from_its_clipped_streak() -> None:
     near = np.s_[55:91, 85:125]
     before, after = (np.abs(np.minimum(p, 1) - np.minimum(sharp, 1))[near].mean() for p in (recorded, restored))
     assert after < 0.5 * before
-    assert restored.min() > -0.05, "a dark ring appears beside the lamp"
+    assert restored.min() > -0.05, "a dark ring appears beside the highlight"
     far = np.s_[20:130, 10:40]
     assert np.abs(restored - sharp)[far].mean() < np.abs(recorded - sharp)[far].mean()
 
 
-def test_a_lamp_does_not_affect_the_rest_of_its_tiles() -> None:
-    """Outside the lamp's streak a tile is as sharp as in the scene without a lamp."""
+def test_a_highlight_does_not_affect_the_rest_of_its_tiles() -> None:
+    """Outside the highlight's streak a tile is as sharp as in the scene without the highlight."""
     sharp, blurred, kernel = _lamp_behind_a_blur()
     dim = np.minimum(sharp, 0.3)
     without = cv2.filter2D(dim, cv2.CV_32F, kernel)

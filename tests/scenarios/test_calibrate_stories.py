@@ -115,7 +115,7 @@ def assert_refused_or_open(done: Any, folder: Path) -> None:
     assert not list(folder.glob("*.yaml*"))
 
 
-# ── starts that are far off ──────────────────────────────────────────────────────────────────────────────────────
+# ── initial values far off ────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize(

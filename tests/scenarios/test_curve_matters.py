@@ -31,8 +31,8 @@ def test_the_right_knots_are_better_on_every_frame(work: Path):
         assert rows[told]["least_right_minus_this_db"] > 0.0
 
 
-def test_the_clipping_mask_makes_lamps_harmless(work: Path):
-    """About 3 % of the pixels are several times too bright. The mask gains 3 dB near the lamps and 1 dB elsewhere."""
+def test_the_clipping_mask_makes_highlights_harmless(work: Path):
+    """With 2 to 5 % of the pixels several times too bright, the mask gains 3 dB near them and 1 dB elsewhere."""
     rows = {row["told"]: row for row in clipping_rows(work, "highlights", SEEDS, FRAMES)}
     assert 0.02 < rows["without"]["clipped"] < 0.05
     for part, least_db in (("near_db", 3.0), ("whole_db", 3.0), ("elsewhere_db", 1.0)):
