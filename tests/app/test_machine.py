@@ -5,8 +5,6 @@ import sys
 
 import pytest
 
-from virest.app.machine import keep_freed_memory
-
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's mallopt")
 
 PROGRAM = """
@@ -31,8 +29,3 @@ def test_kept_memory_is_not_fetched_again() -> None:
         for keep in ("", "keep_freed_memory()")
     ]
     assert faults[1] < 0.05 * max(faults[0], 2000)
-
-
-def test_keeping_memory_twice_is_harmless() -> None:
-    """The return value is the same."""
-    assert keep_freed_memory() == keep_freed_memory()
