@@ -64,12 +64,13 @@ def possible_forms(
     drifts = [_drift_form(kind, knots, stamp, known) for kind in ("scale", "rate")]
     drifts += [_drift_form("delay", stamps, stamp, known), _drift_form("scale", fine, stamp, known, local=True)]
     drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
+    drifts.append(_drift_form("rate", knots[[0, -1]], stamp, known))
     places = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), _off_centre_form(profile)]
     forms = [*places, *drifts]
     forms += step_forms(capture, candidate_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms += [_row_form(count) for count in (ROW_KNOTS, FINE_ROW_KNOTS)]
-    if (focus := _focus_form(capture)) is not None:
+    if (focus := _focus_form(capture, known)) is not None:
         forms.append(focus)
     forms += [_rate_form(capture.imu, profile), _fine_rate_form(capture.imu, profile, known)]
     if capture.imu.has_accelerometer:
@@ -96,7 +97,7 @@ def forms_of_pairs(
     outwards = [np.eye(len(radii))[:, 1:]]
     drawn = _zero("scale", ("radius", TIME), [radii, times], stamp)
     forms.append(_product((drawn,), outwards, mean, LENSES, known))
-    if (focus := _focus_form(capture)) is not None:
+    if (focus := _focus_form(capture, known)) is not None:
         ((dioptres,), log) = focus.fields[0].knots, focus.fields[0].log
         assert log is not None
         drawn = _zero("scale", ("radius", "focus"), [radii, np.array(dioptres)], None, log)
@@ -214,9 +215,10 @@ def _off_centre_form(profile: CameraProfile) -> FieldForm:
 def _drift_form(
     kind: str, knots: Array, stamp_0_ns: int | None, known: frozenset[str], local: bool = False
 ) -> FieldForm:
-    """Over time: a focal length relative to its start, rates about their mean (bias), or a delay.
+    """Over time: a focal length relative to its start, rates, or a delay.
 
-    If a clock offset or skew is in the model, the delay has no mean or slope, respectively.
+    If a bias is in the model, the rates have no mean.  If a clock offset or skew is, the delay has no mean or slope,
+    respectively.
     """
     count, field = len(knots), _zero(kind, (TIME,), [knots], stamp_0_ns)
 
@@ -227,7 +229,7 @@ def _drift_form(
     if kind == "scale":
         free = free[:, 1:]
     elif kind == "rate":
-        free = np.kron(null_space(np.ones((1, count))), np.eye(3))
+        free = np.kron(null_space(np.ones((1, count))) if "gyro_bias" in known else free, np.eye(3))
     else:
         line = {"time_offset": np.ones(count), "clock_skew": np.linspace(-1, 1, count)}
         held = [row for name, row in line.items() if name in known]
@@ -251,8 +253,11 @@ def candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
     return np.linspace(*span_s, min(frames // FRAMES_PER_STEP, MOST_STEPS) + 2)[1:-1]
 
 
-def _focus_form(capture: Capture) -> FieldForm | None:
-    """Over the logged focus distance, relative to the start of the capture."""
+def _focus_form(capture: Capture, known: frozenset[str]) -> FieldForm | None:
+    """Over the logged focus distance; relative to the start of the capture if the focal length is in the model.
+
+    The given focal length holds at an unknown focus distance, so the level is the field's.
+    """
     log = focus_log(capture)
     if log is None or len(log[0]) < 0.5 * len(capture.frames):
         return None
@@ -261,7 +266,13 @@ def _focus_form(capture: Capture) -> FieldForm | None:
         return None
     knots: Array = np.unique(np.round(np.linspace(values.min(), values.max(), FOCUS_KNOTS), 6))
     field = _zero("scale", ("focus",), [knots], None, log)
-    return FieldForm((field,), null_space(cardinal_weights(field.knots[0], values[0])[None]))
+    return _breathing_form(field, float(values[0]), known)
+
+
+def _breathing_form(field: Field, start: float, known: frozenset[str]) -> FieldForm:
+    at_start = cardinal_weights(field.knots[0], start)[None]
+    free = null_space(at_start) if "focal_length" in known else np.eye(at_start.shape[1])
+    return FieldForm((field,), free, build=lambda _profile, now: _breathing_form(field, start, now))
 
 
 def _rate_form(imu: ImuSamples, profile: CameraProfile) -> FieldForm:

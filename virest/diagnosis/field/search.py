@@ -18,6 +18,7 @@ from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals, point_residuals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
 from virest.diagnosis.field.forms import OVER, STD, FieldForm
+from virest.diagnosis.field.levels import given_value_p, level_cause
 from virest.diagnosis.field.records import FittedField
 from virest.diagnosis.field.screening import (
     MIN_BLOCKS,
@@ -31,6 +32,7 @@ from virest.diagnosis.field.screening import (
     select,
 )
 from virest.diagnosis.field.sudden import SuddenChange, best_instant, bias_step, lasting_change, sudden_change
+from virest.diagnosis.geometric_effects import GeometricEffect, geometric_effect
 from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
     EXCESS_SCALE,
@@ -42,6 +44,7 @@ from virest.diagnosis.geometric_ladder import (
     climb_on,
     p_of,
 )
+from virest.diagnosis.selection import POINT_LEVELS
 from virest.diagnosis.structure import STRUCTURE_NOISES
 from virest.inference.chance import beyond_noise, t_ratio
 from virest.inference.track_fit import Term, TrackFit, fit_from
@@ -172,11 +175,15 @@ class _SearchState:
             model = replace(model, profile=entry.effect.term.change(model.profile, back), terms=tuple(terms))
         names = frozenset(term.name for term in model.terms)
         forms = tuple(form.about(model.profile, names) for form in self.forms)
-        for old, new in zip(self.forms, forms, strict=True):
-            if old is not new:
-                less = _without_form(model, old)
-                model = replace(less, terms=(*less.terms, new.term))
+        model = _restarted(model, self.forms, forms)
         return _SearchState(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
+
+    def level_left_to(self, cause: str) -> _SearchState:
+        """The same with forms that leave their level to a cause; these restart from 0."""
+        model = self.model
+        names = frozenset({cause, *(term.name for term in model.terms)})
+        forms = tuple(form.about(model.profile, names) for form in self.forms)
+        return _SearchState(_restarted(model, self.forms, forms), self.accepted, forms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,6 +444,15 @@ def _without_form(model: Model, form: FieldForm) -> Model:
     return replace(model, profile=form.removed_from(model.profile), terms=terms)
 
 
+def _restarted(model: Model, old: Sequence[FieldForm], new: Sequence[FieldForm]) -> Model:
+    """The model with new forms in place of old ones; those that differ restart from 0."""
+    for before, after in zip(old, new, strict=True):
+        if before is not after:
+            less = _without_form(model, before)
+            model = replace(less, terms=(*less.terms, after.term))
+    return model
+
+
 def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool = False) -> HeldOut:
     """Fit on every other block of a few pairs, judge on the remaining blocks, and vice versa.
 
@@ -483,6 +499,7 @@ def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _Sear
     gyroscope that feels gravity.  Nothing is sought where the residuals are noise.
     """
     fitted = evidence.fit(state.model, state.model.terms, evidence.table(state.model, JUDGE_POINTS))
+    state = _with_level_cause(evidence, found, state, fitted)
     if fitted.scale < EXCESS_SCALE:
         return state
     model, accepted = climb_on(evidence, found.nominal.profile, state.model, state.accepted)
@@ -491,12 +508,41 @@ def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _Sear
     return _without_redundant_causes(evidence, found, replace(state, model=model, accepted=accepted))
 
 
+def _with_level_cause(
+    evidence: Evidence, found: GeometricVerdict, state: _SearchState, fitted: TrackFit
+) -> _SearchState:
+    """Add the cause of a field's level where the given value lies outside the field's range; else unchanged."""
+    form = state.forms[-1]
+    name = level_cause(form)
+    if name is None or name in {term.name for term in state.model.terms}:
+        return state
+    if not _is_outside(evidence, found, fitted, form, geometric_effect(name)):
+        return state
+    model, accepted = climb_on(
+        evidence, found.nominal.profile, state.level_left_to(name).model, state.accepted, among=frozenset({name})
+    )
+    if len(accepted) == len(state.accepted):
+        return state
+    return replace(state.level_left_to(name), model=model, accepted=accepted)
+
+
+def _is_outside(
+    evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, form: FieldForm, effect: GeometricEffect
+) -> bool:
+    """Whether the given value of the cause of a field's level lies outside the field's range."""
+    given = found.nominal.profile
+    return POINT_LEVELS.significant(given_value_p(fitted, form, effect, given, evidence.typical_px))
+
+
 def _loses_without(judged: _Judged, by_point: bool, less: Model) -> bool:
     """Whether the cause or form that a smaller model lacks improves held-out blocks, or points."""
     before, after = _held_out(judged.evidence, less, judged.fitted, by_point), judged.held_out(by_point)
     gain = before.block_loss - after.block_loss
     part = float(gain.mean() / before.block_loss.mean())
-    return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
+    if part > LARGE_GAIN:
+        # as much as entered the model may lie in a few blocks
+        return t_ratio(gain) > MIN_LOCAL_T if by_point else _holds_over_time(gain)
+    return part > MIN_GAIN and t_ratio(gain) > MIN_T
 
 
 def _redundant_form(judged: _Judged, state: _SearchState) -> FieldForm | None:
@@ -514,10 +560,29 @@ def _redundant_causes(judged: _Judged, found: GeometricVerdict, state: _SearchSt
     if fitting:
         p_values = {entry.name: _p_value_of(judged.evidence, found, judged.fitted, entry) for entry in fitting}
         weakest = [(max(fitting, key=lambda entry: p_values[entry.name]),)]
-    for leaving in (*depth, *weakest, *combinations(fitting, 2)):
+    outside, inside = _level_causes(judged, found, state, fitting)
+    for leaving in (*depth, *inside, *weakest, *combinations(fitting, 2)):
+        if not outside.isdisjoint(entry.name for entry in leaving):
+            continue
         if not _loses_without(judged, state.is_dense(judged.evidence.period_s), state.without(found, leaving).model):
             return leaving
     return ()
+
+
+def _level_causes(
+    judged: _Judged, found: GeometricVerdict, state: _SearchState, causes: Sequence[Accepted]
+) -> tuple[frozenset[str], list[tuple[Accepted]]]:
+    """Among causes of the levels of fields: (names of those with given values outside the range, those inside)."""
+    outside: set[str] = set()
+    inside: list[tuple[Accepted]] = []
+    for entry in causes:
+        assert entry.effect is not None
+        forms = [form for form in state.forms if level_cause(form) == entry.name]
+        if any(_is_outside(judged.evidence, found, judged.fitted, form, entry.effect) for form in forms):
+            outside.add(entry.name)
+        elif forms:
+            inside.append((entry,))
+    return frozenset(outside), inside
 
 
 def _p_value_of(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry: Accepted) -> float:
