@@ -183,6 +183,28 @@ def test_a_lens_that_breathes_runs_along_the_focus_and_names_time_as_its_rival()
     assert not field.fields[0].belongs_to_one_capture
 
 
+@pytest.mark.parametrize("given", [0.0, 1.5])
+def test_a_focal_length_that_holds_at_some_focus_distance_is_no_error(given: float) -> None:
+    """Given for infinity or for a focus distance in the capture, it was named beside the breathing."""
+    breathing = Strange(longer=lambda t: 0.02 * (focus_dioptres(t) - given), focus_dioptres=focus_dioptres)
+    phone = StrangePhone(replace(HAND, seed=75), breathing)
+    verdict, (field,) = judged(phone, phone.profile)
+    assert not verdict.accepted
+    assert field.covariates == ("focus",)
+    assert error(field, lambda dioptres: 0.02 * (dioptres - given)) < 0.1
+
+
+def test_a_focal_length_that_holds_at_no_focus_distance_is_named() -> None:
+    """Three per cent beyond all that the lens takes by breathing 2 %."""
+    breathing = Strange(longer=lambda t: 0.01 * focus_dioptres(t) - 0.05, focus_dioptres=focus_dioptres)
+    phone = StrangePhone(replace(HAND, seed=75), breathing)
+    verdict, (field,) = judged(phone, phone.profile)
+    assert [entry.name for entry in verdict.accepted] == ["focal_length"]
+    assert field.covariates == ("focus",)
+    assert field.size == pytest.approx(0.02, rel=0.1)
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+
+
 def test_a_lens_goes_on_focusing_while_the_last_frame_is_read() -> None:
     """Held at its last value, the log bent the last pair, which a curve over time then explained in its place."""
     dioptres = Strange(focus_dioptres=lambda t: 0.5 + 0.3 * t)
@@ -247,6 +269,27 @@ def test_a_bias_that_changes_at_an_instant_is_a_step() -> None:
     assert (field.kind, field.covariates, field.shape) == ("rate", ("time",), "a step")
     assert field.fields[0].knots[0][0] == pytest.approx(1.13, abs=0.02)
     assert np.array(field.fields[0].values)[-1] == pytest.approx(-change, abs=0.002)
+    assert verdict.final_rms_px < 1.1 * HAND.noise_px
+
+
+def test_a_bias_that_drifts_evenly_is_a_line_and_no_bias_beside_a_step() -> None:
+    """A step with fewer numbers than a curve was taken for it, and the cause that held the mean left the curve."""
+    change = np.array([0.02, -0.015, 0.01])
+    phone = StrangePhone(HAND, Strange(gyro=lambda t, reading, force: reading + 0.5 * np.outer(t, change)))
+    verdict, (field,) = judged(phone, phone.profile, rungs=1)
+    assert not verdict.accepted
+    assert (field.covariates, field.shape) == (("time",), "a straight line")
+    assert np.array(field.fields[0].values)[-1] == pytest.approx(-0.5 * phone.stamp_s[-1] * change, abs=0.002)
+    assert verdict.final_rms_px < 1.1 * HAND.noise_px
+
+
+def test_a_bias_beside_a_drift_that_does_not_reach_it_keeps_its_name() -> None:
+    """The given bias is off by more than the drift."""
+    change = np.array([0.01, -0.008, 0.005])
+    phone = StrangePhone(HAND, Strange(gyro=lambda t, reading, force: reading + np.outer(0.5 * t + 2, change)))
+    verdict, (field,) = judged(phone, phone.profile, rungs=1)
+    assert [entry.name for entry in verdict.accepted] == ["gyro_bias"]
+    assert (field.kind, field.covariates) == ("rate", ("time",))
     assert verdict.final_rms_px < 1.1 * HAND.noise_px
 
 
@@ -616,6 +659,22 @@ def test_a_readout_that_changes_is_a_delay_over_row_and_time() -> None:
     assert field.shape.startswith("a straight line of the row times")
     assert gained(field) > 0.8
     assert field.fields[0].belongs_to_one_capture
+
+
+def test_a_readout_that_follows_the_exposure_holds_for_the_phone() -> None:
+    """Exposures that change from frame to frame: no curve over time follows them."""
+    setup = replace(HAND, seed=94, exposure_swing=0.5)
+
+    def late_in_frame_s(row, stamp_s):
+        exposure_s = np.interp(stamp_s, phone.stamp_s, phone.exposure_s)
+        return 0.3 * row * np.maximum(exposure_s - setup.exposure_s, 0)
+
+    phone = StrangePhone(setup, Strange(late_in_frame_s=late_in_frame_s))
+    verdict, (field,) = judged(phone, phone.profile)
+    assert not verdict.accepted
+    assert (field.kind, field.covariates) == ("delay", ("row", "exposure"))
+    assert gained(field) > 0.8
+    assert not field.fields[0].belongs_to_one_capture
 
 
 def test_distortion_that_follows_the_focus_holds_for_the_phone() -> None:

@@ -51,15 +51,18 @@ LEAST_BLUR_PX, BLUR_LEVELS = 0.05, 8
 """Standard deviation up to which uniform blur is skipped; blurred copies that spatially varying blur interpolates."""
 
 
-def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array, first_row_s: float) -> Array:
+def late_rows_s(
+    profile: CameraProfile, hidden: Hidden, fraction: Array, first_row_s: float, logged_exposure_s: float = 0.0
+) -> Array:
     """Delay of each row (rows,) against an even readout, by readout fraction; first_row_s: IMU clock."""
     late = np.zeros(len(fraction))
     if profile.shutter.uneven is not None:
         late = late + profile.shutter.uneven.at(fraction)[:, 0]
     begun = fraction + late / (profile.shutter.readout_time_s or 1.0)
     for field in profile.extensions.field:
-        if field.kind == "delay" and field.covariates == ("row", "time"):
-            late = late + field.at(begun, profile.camera_time_s(first_row_s))[:, 0]
+        if field.kind == "delay" and field.is_pair:
+            over_time = field.covariates[1] == "time"
+            late = late + field.at(begun, profile.camera_time_s(first_row_s) if over_time else logged_exposure_s)[:, 0]
     for hide in (hidden.row_delay_s, hidden.row_delay_at and partial(hidden.row_delay_at, first_row_s)):
         late = late if hide is None else late + hide(fraction)
     return late

@@ -19,7 +19,8 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import focus_log
 from virest.capture.records import Capture
-from virest.diagnosis.field.forms import FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
+from virest.diagnosis.candidates import varies
+from virest.diagnosis.field.forms import EXPOSURE, FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
 
 ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5
 """Knots of the coarse forms.  The fewer, the weaker an effect they detect: a cubic spline through 4, 5, 6 or 7 knots
@@ -32,6 +33,9 @@ MOST_PLACE_KNOTS = FINE_PLACE_KNOTS + PLACE_KNOTS - 1
 """The same for maps."""
 PAIR_KNOTS = 3
 """Knots over the row or the radius in a pair: a parabola, and 0 at the first knot."""
+MOST_PAIR_KNOTS = {TIME: MOST_KNOTS, EXPOSURE: 4 * PAIR_KNOTS - 3}
+"""Knots over the second covariate of a pair after refinement.  A readout that changes above some exposure does so
+within an eighth of the range."""
 LEAST_TIMES, TIME_STEPS = 4, ((0.4, 12), (0.1, MOST_KNOTS))
 """(knot spacing in s, maximum number of knots) over time, coarse and fine.  0.1 s is 3 frames; a hunting focus has a
 period of 0.5 s."""
@@ -83,57 +87,63 @@ def forms_of_pairs(
 ) -> list[FieldForm]:
     """Interactions of two covariates: tensor products of a curve along each.
 
-    They are 0 at the first row, at the principal point and at rest, where the effect depends on time or focus alone.
-    They include the part constant over time or focus, unless a cause or a field in the model (known) models it.
+    They are 0 at the first row, at the principal point and at rest, where the effect depends on the other covariate
+    alone.  They include the part constant over that one, unless a cause or a field in the model (known) models it.
     """
     times = _rounded(_times(span_s, *TIME_STEPS[0]))
-    stamp, mean = capture.stamp_0_ns, np.ones((1, len(times)))
+    stamp = capture.stamp_0_ns
     forms = []
     if profile.shutter.readout_time_s > 0:
-        rows = np.linspace(0, 1, PAIR_KNOTS)
+        rows, later = np.linspace(0, 1, PAIR_KNOTS), [np.eye(PAIR_KNOTS)[:, 1:]]
         late = _zero("delay", ("row", TIME), [rows, np.asarray(profile.camera_time_s(times))], stamp)
-        forms.append(_product((late,), [np.eye(len(rows))[:, 1:]], mean, READOUTS, known))
+        forms.append(_product((late,), later, None, READOUTS, known))
+        logged_s = np.array([frame.exposure_s for frame in capture.frames if frame.exposure_s])
+        if len(logged_s) and varies(logged_s):
+            knots = np.linspace(logged_s.min(), logged_s.max(), min(PAIR_KNOTS, len(np.unique(logged_s))))
+            late = _zero("delay", ("row", EXPOSURE), [rows, knots])
+            forms.append(_product((late,), later, logged_s, READOUTS, known))
     radii = np.linspace(0, 0.5 * np.hypot(profile.width, profile.height), PAIR_KNOTS)
     outwards = [np.eye(len(radii))[:, 1:]]
     drawn = _zero("scale", ("radius", TIME), [radii, times], stamp)
-    forms.append(_product((drawn,), outwards, mean, LENSES, known))
+    forms.append(_product((drawn,), outwards, None, LENSES, known))
     if (focus := _focus_form(capture, known)) is not None:
         ((dioptres,), log) = focus.fields[0].knots, focus.fields[0].log
         assert log is not None
         drawn = _zero("scale", ("radius", "focus"), [radii, np.array(dioptres)], None, log)
-        typical = cardinal_weights(dioptres, np.array(log[1])).mean(axis=0, keepdims=True)
-        forms.append(_product((drawn,), outwards, typical, LENSES, known))
+        forms.append(_product((drawn,), outwards, np.array(log[1]), LENSES, known))
     reaches = [np.array([-reach, reach]) for reach in _reaches(capture.imu, profile)]
     rates = tuple(_zero("rate", (name, TIME), [ends, times], stamp) for name, ends in zip(RATES, reaches, strict=True))
     odd = [np.array([[-1.0], [1.0]]) / np.sqrt(2)] * 3
-    return [*forms, _product(rates, odd, mean, GYROS, known)]
+    return [*forms, _product(rates, odd, None, GYROS, known)]
 
 
 def _product(
-    fields: tuple[Field, ...], first: list[Array], mean: Array, steady: frozenset[str], known: frozenset[str]
+    fields: tuple[Field, ...], first: list[Array], logged: Array | None, steady: frozenset[str], known: frozenset[str]
 ) -> FieldForm:
     """first: basis along the first covariate of each field; steady: terms that model the constant part.
 
-    If one of these terms is known, the mean (1, knots) over the second covariate is 0.  Each of the 3 rate fields acts
-    on its own axis.
+    If one of these terms is known, the mean over the second covariate is 0.  logged: its values; None: it is the time,
+    evenly spread.  Each of the 3 rate fields acts on its own axis.
     """
-    changing = null_space(mean) if known & steady else np.eye(mean.shape[1])
-    more = 2 * mean.shape[1] - 1
+    second, knots = fields[0].covariates[1], fields[0].knots[1]
+    weights = np.ones((1, len(knots))) if logged is None else cardinal_weights(knots, logged)
+    changing = null_space(weights.mean(axis=0, keepdims=True)) if known & steady else np.eye(len(knots))
+    more = 2 * len(knots) - 1
     refine: Recipe | None = None
-    if fields[0].covariates[1] == TIME and more <= MOST_KNOTS:
-        finer = tuple(_with_times(field, more) for field in fields)
-        refine = lambda _profile, now: _product(finer, first, np.ones((1, more)), steady, now)  # noqa: E731
+    if second in MOST_PAIR_KNOTS and more <= MOST_PAIR_KNOTS[second]:
+        finer = tuple(_with_knots(field, more) for field in fields)
+        refine = lambda _profile, now: _product(finer, first, logged, steady, now)  # noqa: E731
     axes = np.eye(len(fields))
     bases = [np.kron(np.kron(along, changing), axes[:, k : k + 1]) for k, along in enumerate(first)]
-    again: Recipe = lambda _profile, now: _product(fields, first, mean, steady, now)  # noqa: E731
+    again: Recipe = lambda _profile, now: _product(fields, first, logged, steady, now)  # noqa: E731
     return FieldForm(fields, np.asarray(block_diag(*bases)), build=again, refine=refine)
 
 
-def _with_times(field: Field, count: int) -> Field:
-    """The same field with this many knots over time and value 0 everywhere."""
-    first, times = field.knots
+def _with_knots(field: Field, count: int) -> Field:
+    """The same field with this many even knots over its second covariate and value 0 everywhere."""
+    first, second = field.knots
     return _zero(
-        field.kind, field.covariates, [np.array(first), np.linspace(times[0], times[-1], count)], field.stamp_0_ns
+        field.kind, field.covariates, [np.array(first), np.linspace(second[0], second[-1], count)], field.stamp_0_ns
     )
 
 

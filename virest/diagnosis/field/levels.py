@@ -1,8 +1,8 @@
 """The level of a field: its constant part, which a named cause would describe as well.
 
-A profile's focal length holds at some focus distance, and a bias at some time, that nobody recorded.  Where a lens
-breathes or a bias drifts, the given value is therefore no error as long as the camera takes it somewhere in its range:
-the field keeps its own level.  The cause is named beside the field only if the given value lies outside this range.
+A profile's focal length holds at some focus distance, its readout time at some exposure, and its bias at some time that
+nobody recorded.  Where they change, the given value is therefore no error as long as the camera takes it somewhere in
+its range: the field keeps its own level.  The cause is named beside the field only if the given value lies outside.
 """
 
 from __future__ import annotations
@@ -12,15 +12,23 @@ import numpy as np
 from virest.arrays import Array
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.field.forms import OVER, TIME, FieldForm
+from virest.diagnosis.field.forms import EXPOSURE, OVER, TIME, FieldForm
 from virest.diagnosis.geometric_effects import GeometricEffect
 from virest.inference.chance import chi2_tail
 from virest.inference.track_fit import TrackFit
 from virest.inference.tracking_bias import bias_std
 
-LEVELS = {f"scale{OVER}focus": ("focal_length", 1.0), f"rate{OVER}{TIME}": ("gyro_bias", -1.0)}
+LEVELS = {
+    f"scale{OVER}focus": ("focal_length", 1.0),
+    f"rate{OVER}{TIME}": ("gyro_bias", -1.0),
+    f"delay{OVER}row, {TIME}": ("readout_time", 1.0),
+    f"delay{OVER}row, {EXPOSURE}": ("readout_time", 1.0),
+}
 """By family of forms: the cause that describes its constant part, and the sign of a field's values in that cause's.
-A rate is the true one minus the gyroscope's, so that it lowers the bias."""
+A rate is the true one minus the gyroscope's, so that it lowers the bias; the last row's delay lengthens the readout."""
+FROM_ZERO = ("focus", EXPOSURE)
+"""Covariates whose range begins at 0, where values are specified: a lens at infinity, a readout without an exposure.
+Both laws are nearly linear: the image distance in the dioptres, and a line's time in its exposure."""
 SAMPLES = 101
 """Steps of 1 % of the range."""
 
@@ -62,14 +70,15 @@ def _covariance(fitted: TrackFit, cause: str, form: str, of_numbers: Array) -> A
 
 
 def _range_weights(field: Field) -> Array:
-    """Weights (m, knots) of the knot values over the range that a camera takes.
+    """Weights (m, knots) of the knot values over the range that a camera takes; of two covariates, in the last row.
 
-    Over the focus distance, infinity is included, for which lenses are specified: the image distance, and with it the
-    picture's scale, is linear in the dioptres, so the straight line through the field's values is continued to 0.
+    The straight line through the values is continued to 0 where the range begins there.
     """
-    (knots,) = field.knots
-    inside = cardinal_weights(knots, np.linspace(knots[0], knots[-1], SAMPLES))
-    if field.covariates != ("focus",):
-        return inside
-    line = np.linalg.pinv(np.stack([np.ones(len(knots)), np.array(knots)], axis=-1))
-    return np.concatenate([inside, line[:1]])
+    knots = field.knots[-1]
+    weights = cardinal_weights(knots, np.linspace(knots[0], knots[-1], SAMPLES))
+    if field.covariates[-1] in FROM_ZERO:
+        line = np.linalg.pinv(np.stack([np.ones(len(knots)), np.array(knots)], axis=-1))
+        weights = np.concatenate([weights, line[:1]])
+    if len(field.knots) == 1:
+        return weights
+    return np.asarray(np.kron(np.eye(len(field.knots[0]))[-1:], weights))

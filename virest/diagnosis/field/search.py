@@ -160,7 +160,8 @@ class _SearchState:
     def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _SearchState:
         """The same without some causes, whose parameters return to their nominal values.
 
-        Forms that depend on these causes, such as a displacement on the principal point, restart from 0.
+        Forms that depend on these causes restart from 0 if they cannot hold their values: a displacement about another
+        principal point.
         """
         model = self.model
         for entry in leaving:
@@ -445,11 +446,12 @@ def _without_form(model: Model, form: FieldForm) -> Model:
 
 
 def _restarted(model: Model, old: Sequence[FieldForm], new: Sequence[FieldForm]) -> Model:
-    """The model with new forms in place of old ones; those that differ restart from 0."""
+    """The model with new forms in place of old ones; those that cannot hold their values restart from 0."""
     for before, after in zip(old, new, strict=True):
         if before is not after:
             less = _without_form(model, before)
-            model = replace(less, terms=(*less.terms, after.term))
+            profile = model.profile if after.can_hold(model.profile) else less.profile
+            model = replace(less, profile=profile, terms=(*less.terms, after.term))
     return model
 
 
@@ -561,7 +563,9 @@ def _redundant_causes(judged: _Judged, found: GeometricVerdict, state: _SearchSt
         p_values = {entry.name: _p_value_of(judged.evidence, found, judged.fitted, entry) for entry in fitting}
         weakest = [(max(fitting, key=lambda entry: p_values[entry.name]),)]
     outside, inside = _level_causes(judged, found, state, fitting)
-    for leaving in (*depth, *inside, *weakest, *combinations(fitting, 2)):
+    if inside:
+        return inside[:1]
+    for leaving in (*depth, *weakest, *combinations(fitting, 2)):
         if not outside.isdisjoint(entry.name for entry in leaving):
             continue
         if not _loses_without(judged, state.is_dense(judged.evidence.period_s), state.without(found, leaving).model):
@@ -571,18 +575,21 @@ def _redundant_causes(judged: _Judged, found: GeometricVerdict, state: _SearchSt
 
 def _level_causes(
     judged: _Judged, found: GeometricVerdict, state: _SearchState, causes: Sequence[Accepted]
-) -> tuple[frozenset[str], list[tuple[Accepted]]]:
-    """Among causes of the levels of fields: (names of those with given values outside the range, those inside)."""
+) -> tuple[frozenset[str], tuple[Accepted, ...]]:
+    """Among causes of the levels of fields: (names of those with given values outside the range, those inside).
+
+    A cause inside needs no test: the field describes the same with its own level.
+    """
     outside: set[str] = set()
-    inside: list[tuple[Accepted]] = []
+    inside: list[Accepted] = []
     for entry in causes:
         assert entry.effect is not None
-        forms = [form for form in state.forms if level_cause(form) == entry.name]
+        forms = [form for form in state.forms if level_cause(form) == entry.name and form.step_s is None]
         if any(_is_outside(judged.evidence, found, judged.fitted, form, entry.effect) for form in forms):
             outside.add(entry.name)
         elif forms:
-            inside.append((entry,))
-    return frozenset(outside), inside
+            inside.append(entry)
+    return frozenset(outside), tuple(inside)
 
 
 def _p_value_of(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry: Accepted) -> float:
