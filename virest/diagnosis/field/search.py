@@ -236,11 +236,17 @@ def _step(
     gained_px = np.sqrt(max(entered.before.rms**2 - left**2, 0.0)) * typical
     shared_px = STRUCTURE_NOISES * left * typical if entered.form.local else 0.0
     small = gained_px < max(MIN_SIZE_PX if proposal.selection else 0.0, shared_px)
-    return (
-        None
-        if (small or proposal.instead) and len(after.accepted) == len(state.accepted)
-        else (proposal, entered, after)
-    )
+    if small or proposal.instead:
+        replaces = len(after.accepted) < len(state.accepted)
+        if not replaces or not _is_better(judged, after.model, entered.form.local):
+            return None
+    return proposal, entered, after
+
+
+def _is_better(judged: _Judged, model: Model, by_point: bool) -> bool:
+    """Whether a model predicts held-out data better than the judged one by RIVAL_T standard errors."""
+    after = _held_out(judged.evidence, model, judged.fitted, by_point)
+    return t_ratio(judged.held_out(by_point).block_loss - after.block_loss) > RIVAL_T
 
 
 @dataclass(frozen=True, slots=True)
