@@ -19,6 +19,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import focus_log
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
+from virest.diagnosis.field.form_list import forms_of_pairs
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import is_believable, with_fields
 from virest.diagnosis.field.stretches import bridging_form, rate_walk
@@ -659,6 +660,20 @@ def test_a_readout_that_changes_is_a_delay_over_row_and_time() -> None:
     assert field.shape.startswith("a straight line of the row times")
     assert gained(field) > 0.8
     assert field.fields[0].belongs_to_one_capture
+
+
+@pytest.mark.parametrize(("exposures_s", "knots"), [((0.008,), 0), ((0.004, 0.008), 2), ((0.004, 0.005, 0.008), 3)])
+def test_rows_are_paired_with_exposures_that_vary(exposures_s: tuple[float, ...], knots: int) -> None:
+    """With no more knots than logged exposures; a readout in the model takes the mean."""
+    phone = StrangePhone(HAND, Strange())
+    frames = [
+        replace(frame, exposure_s=exposures_s[k % len(exposures_s)]) for k, frame in enumerate(phone.capture.frames)
+    ]
+    capture = replace(phone.capture, frames=tuple(frames))
+    for known in (frozenset[str](), frozenset({"readout_time"})):
+        forms = forms_of_pairs(capture, phone.profile, (0.0, 2.0), known)
+        numbers = {form.covariates: form.basis.shape[1] for form in forms}
+        assert numbers.get(("row", "exposure"), 0) == 2 * max(knots - len(known), 0)
 
 
 def test_a_readout_that_follows_the_exposure_holds_for_the_phone() -> None:

@@ -526,12 +526,9 @@ def _with_level_cause(
         return state
     if not _is_outside(evidence, found, fitted, form, geometric_effect(name)):
         return state
-    model, accepted = climb_on(
-        evidence, found.nominal.profile, state.level_left_to(name).model, state.accepted, among=frozenset({name})
-    )
-    if len(accepted) == len(state.accepted):
-        return state
-    return replace(state.level_left_to(name), model=model, accepted=accepted)
+    left = state.level_left_to(name)
+    model, accepted = climb_on(evidence, found.nominal.profile, left.model, left.accepted, frozenset({name}))
+    return state if len(accepted) == len(state.accepted) else replace(left, model=model, accepted=accepted)
 
 
 def _is_outside(
