@@ -157,9 +157,12 @@ class _SearchState:
         """Whether any form has knots as dense as the blocks at this frame period."""
         return any(form.is_dense(2 * PAIRS_IN_BLOCK * period_s) for form in self.forms)
 
-    def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _SearchState:
+    def without(
+        self, found: GeometricVerdict, leaving: Sequence[Accepted], known: frozenset[str] = frozenset()
+    ) -> _SearchState:
         """The same without some causes, whose parameters return to their nominal values.
 
+        known: names of causes to which forms leave their level even without them in the model.
         Forms that depend on these causes restart from 0 if they cannot hold their values: a displacement about another
         principal point.
         """
@@ -174,10 +177,15 @@ class _SearchState:
             back = -entry.effect.total_change(found.nominal.profile, model.profile)
             terms: Sequence[Term] = [term for term in model.terms if term.name != name]
             model = replace(model, profile=entry.effect.term.change(model.profile, back), terms=tuple(terms))
-        names = frozenset(term.name for term in model.terms)
+        names = known | {term.name for term in model.terms}
         forms = tuple(form.about(model.profile, names) for form in self.forms)
         model = _restarted(model, self.forms, forms)
         return _SearchState(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
+
+    def frees_level(self, form: FieldForm, cause: str) -> bool:
+        """Whether a form takes over the level if a cause leaves."""
+        names = frozenset(term.name for term in self.model.terms if term.name != cause)
+        return form.about(self.model.profile, names).basis.shape[1] > form.basis.shape[1]
 
     def level_left_to(self, cause: str) -> _SearchState:
         """The same with forms that leave their level to a cause; these restart from 0."""
@@ -569,9 +577,8 @@ def _redundant_causes(judged: _Judged, found: GeometricVerdict, state: _SearchSt
     if inside:
         return inside[:1]
     for leaving in (*depth, *weakest, *combinations(fitting, 2)):
-        if not outside.isdisjoint(entry.name for entry in leaving):
-            continue
-        if not _loses_without(judged, state.is_dense(judged.evidence.period_s), state.without(found, leaving).model):
+        less = state.without(found, leaving, outside).model
+        if not _loses_without(judged, state.is_dense(judged.evidence.period_s), less):
             return leaving
     return ()
 
@@ -587,7 +594,8 @@ def _level_causes(
     inside: list[Accepted] = []
     for entry in causes:
         assert entry.effect is not None
-        forms = [form for form in state.forms if level_cause(form) == entry.name and form.step_s is None]
+        forms = [form for form in state.forms if level_cause(form) == entry.name]
+        forms = [form for form in forms if state.frees_level(form, entry.name)]
         if any(_is_outside(judged.evidence, found, judged.fitted, form, entry.effect) for form in forms):
             outside.add(entry.name)
         elif forms:
