@@ -246,15 +246,16 @@ def _step(
     small = gained_px < max(MIN_SIZE_PX if proposal.selection else 0.0, shared_px)
     if small or proposal.instead:
         replaces = len(after.accepted) < len(state.accepted)
-        if not replaces or not _is_better(judged, after.model, entered.form.local):
+        if not replaces or not _is_better(judged, after.model, entered.form):
             return None
     return proposal, entered, after
 
 
-def _is_better(judged: _Judged, model: Model, by_point: bool) -> bool:
-    """Whether a model predicts held-out data better than the judged one by RIVAL_T standard errors."""
-    after = _held_out(judged.evidence, model, judged.fitted, by_point)
-    return t_ratio(judged.held_out(by_point).block_loss - after.block_loss) > RIVAL_T
+def _is_better(judged: _Judged, model: Model, form: FieldForm) -> bool:
+    """Whether a model with a form predicts held-out data better than the judged one by RIVAL_T standard errors."""
+    after = _held_out(judged.evidence, model, judged.fitted, form.local)
+    gain = judged.held_out(form.local).block_loss - after.block_loss
+    return _holds_over_time(gain) if form.over_time and not form.local else t_ratio(gain) > RIVAL_T
 
 
 @dataclass(frozen=True, slots=True)
