@@ -17,6 +17,7 @@ from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import focus_log
+from virest.diagnosis.ambiguities import merged
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.form_list import forms_of_pairs
@@ -29,6 +30,8 @@ from virest.diagnosis.findings import FieldFinding
 from virest.diagnosis.geometric_evidence import Evidence, Model, base_scene, make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.diagnosis.ladder import with_exposure_of
+from virest.diagnosis.picture_ladder import PictureVerdict
 from virest.image_formation.point_model import TrackTable
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.profile_terms import FOCAL_DRIFT, GYRO_BIAS, K1, PRINCIPAL_POINT
@@ -715,6 +718,14 @@ def test_a_gyroscope_whose_scale_drifts_is_a_rate_over_rate_and_time() -> None:
     assert not verdict.accepted
     assert (field.kind, field.covariates) == ("rate", ("rate", "time"))
     assert gained(field) > 0.8
+
+
+def test_an_exposure_that_a_field_has_replaced_is_not_in_the_extended_profile() -> None:
+    """Brightness is judged before the search for fields, under a scale that the ladder had found."""
+    given = StrangePhone(HAND, Strange()).profile
+    light = PictureVerdict(given.with_shutter(exposure_scale=0.74))
+    lit = with_exposure_of(light, given).profile
+    assert merged(given, lit, lit, is_exposure=False).shutter.exposure_scale == 1.0
 
 
 class WanderingPhone(StrangePhone):
