@@ -327,7 +327,7 @@ class DiagnosisSession:
 
 
 def with_exposure_of(light: PictureVerdict, moved: CameraProfile) -> PictureVerdict:
-    """A verdict on brightness with the exposure scale of another profile: of a cause that a field has replaced since."""
+    """A verdict on brightness with another profile's exposure scale, whose cause a field may have replaced since."""
     return replace(light, profile=light.profile.with_shutter(exposure_scale=moved.shutter.exposure_scale))
 
 
