@@ -17,8 +17,10 @@ from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import focus_log
+from virest.diagnosis.ambiguities import merged
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
 from virest.diagnosis.field.design import point_residuals
+from virest.diagnosis.field.form_list import forms_of_pairs
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import is_believable, with_fields
 from virest.diagnosis.field.stretches import bridging_form, rate_walk
@@ -28,6 +30,8 @@ from virest.diagnosis.findings import FieldFinding
 from virest.diagnosis.geometric_evidence import Evidence, Model, base_scene, make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.diagnosis.ladder import with_exposure_of
+from virest.diagnosis.picture_ladder import PictureVerdict
 from virest.image_formation.point_model import TrackTable
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.profile_terms import FOCAL_DRIFT, GYRO_BIAS, K1, PRINCIPAL_POINT
@@ -186,6 +190,28 @@ def test_a_breathing_lens_is_a_scale_over_the_focus_with_time_as_rival() -> None
     assert not field.fields[0].belongs_to_one_capture
 
 
+@pytest.mark.parametrize("given", [0.0, 1.5])
+def test_a_focal_length_that_holds_at_some_focus_distance_is_no_error(given: float) -> None:
+    """The profile holds at infinity or at a focus distance of the capture: the breathing field alone explains it."""
+    breathing = Strange(longer=lambda t: 0.02 * (focus_dioptres(t) - given), focus_dioptres=focus_dioptres)
+    phone = StrangePhone(replace(HAND, seed=75), breathing)
+    verdict, (field,) = judged(phone, phone.profile)
+    assert not verdict.accepted
+    assert field.covariates == ("focus",)
+    assert error(field, lambda dioptres: 0.02 * (dioptres - given)) < 0.1
+
+
+def test_a_focal_length_that_holds_at_no_focus_distance_is_named() -> None:
+    """The profile lies 3 % outside the range that a breathing of 2 % covers."""
+    breathing = Strange(longer=lambda t: 0.01 * focus_dioptres(t) - 0.05, focus_dioptres=focus_dioptres)
+    phone = StrangePhone(replace(HAND, seed=75), breathing)
+    verdict, (field,) = judged(phone, phone.profile)
+    assert [entry.name for entry in verdict.accepted] == ["focal_length"]
+    assert field.covariates == ("focus",)
+    assert field.size == pytest.approx(0.02, rel=0.1)
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+
+
 def test_the_focus_log_extends_beyond_the_last_frame() -> None:
     """The log is extrapolated over the readout of the last frame; a constant value would bias the last pair."""
     dioptres = Strange(focus_dioptres=lambda t: 0.5 + 0.3 * t)
@@ -250,6 +276,27 @@ def test_a_sudden_change_of_bias_is_a_step() -> None:
     assert (field.kind, field.covariates, field.shape) == ("rate", ("time",), "a step")
     assert field.fields[0].knots[0][0] == pytest.approx(1.13, abs=0.02)
     assert np.array(field.fields[0].values)[-1] == pytest.approx(-change, abs=0.002)
+    assert verdict.final_rms_px < 1.1 * HAND.noise_px
+
+
+def test_a_bias_that_drifts_evenly_is_a_line_and_no_bias_beside_a_step() -> None:
+    """A line has as few numbers as a step, and holds the mean of the bias itself."""
+    change = np.array([0.02, -0.015, 0.01])
+    phone = StrangePhone(HAND, Strange(gyro=lambda t, reading, force: reading + 0.5 * np.outer(t, change)))
+    verdict, (field,) = judged(phone, phone.profile, rungs=1)
+    assert not verdict.accepted
+    assert (field.covariates, field.shape) == (("time",), "a straight line")
+    assert np.array(field.fields[0].values)[-1] == pytest.approx(-0.5 * phone.stamp_s[-1] * change, abs=0.002)
+    assert verdict.final_rms_px < 1.1 * HAND.noise_px
+
+
+def test_a_bias_beside_a_drift_that_does_not_reach_it_keeps_its_name() -> None:
+    """The given bias lies outside the range of the drift."""
+    change = np.array([0.01, -0.008, 0.005])
+    phone = StrangePhone(HAND, Strange(gyro=lambda t, reading, force: reading + np.outer(0.5 * t + 2, change)))
+    verdict, (field,) = judged(phone, phone.profile, rungs=1)
+    assert [entry.name for entry in verdict.accepted] == ["gyro_bias"]
+    assert (field.kind, field.covariates) == ("rate", ("time",))
     assert verdict.final_rms_px < 1.1 * HAND.noise_px
 
 
@@ -621,6 +668,36 @@ def test_a_changing_readout_is_a_delay_over_row_and_time() -> None:
     assert field.fields[0].belongs_to_one_capture
 
 
+@pytest.mark.parametrize(("exposures_s", "knots"), [((0.008,), 0), ((0.004, 0.008), 2), ((0.004, 0.005, 0.008), 3)])
+def test_rows_are_paired_with_exposures_that_vary(exposures_s: tuple[float, ...], knots: int) -> None:
+    """The field has at most as many knots as logged exposures; a fitted readout takes its mean."""
+    phone = StrangePhone(HAND, Strange())
+    frames = [
+        replace(frame, exposure_s=exposures_s[k % len(exposures_s)]) for k, frame in enumerate(phone.capture.frames)
+    ]
+    capture = replace(phone.capture, frames=tuple(frames))
+    for known in (frozenset[str](), frozenset({"readout_time"})):
+        forms = forms_of_pairs(capture, phone.profile, (0.0, 2.0), known)
+        numbers = {form.covariates: form.basis.shape[1] for form in forms}
+        assert numbers.get(("row", "exposure"), 0) == 2 * max(knots - len(known), 0)
+
+
+def test_a_readout_that_follows_the_exposure_holds_for_the_phone() -> None:
+    """The exposure changes from frame to frame, so no curve over time fits."""
+    setup = replace(HAND, seed=94, exposure_swing=0.5)
+
+    def late_in_frame_s(row, stamp_s):
+        exposure_s = np.interp(stamp_s, phone.stamp_s, phone.exposure_s)
+        return 0.3 * row * np.maximum(exposure_s - setup.exposure_s, 0)
+
+    phone = StrangePhone(setup, Strange(late_in_frame_s=late_in_frame_s))
+    verdict, (field,) = judged(phone, phone.profile)
+    assert not verdict.accepted
+    assert (field.kind, field.covariates) == ("delay", ("row", "exposure"))
+    assert gained(field) > 0.8
+    assert not field.fields[0].belongs_to_one_capture
+
+
 def test_distortion_that_follows_the_focus_holds_for_the_phone() -> None:
     """It is a scale over radius and focus; time explains this capture equally well and is named as a rival."""
 
@@ -644,6 +721,14 @@ def test_a_gyroscope_whose_scale_drifts_is_a_rate_over_rate_and_time() -> None:
     assert not verdict.accepted
     assert (field.kind, field.covariates) == ("rate", ("rate", "time"))
     assert gained(field) > 0.8
+
+
+def test_an_exposure_that_a_field_has_replaced_is_not_in_the_extended_profile() -> None:
+    """The photometric stage keeps a scale that a later field replaced; the profile must not."""
+    given = StrangePhone(HAND, Strange()).profile
+    light = PictureVerdict(given.with_shutter(exposure_scale=0.74))
+    lit = with_exposure_of(light, given).profile
+    assert merged(given, lit, lit, is_exposure=False).shutter.exposure_scale == 1.0
 
 
 class WanderingPhone(StrangePhone):

@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
 from virest.camera.field import Field
 from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import format_profile, parse_profile
 from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
 from virest.image_formation.row_clock import RowClock
@@ -108,6 +110,22 @@ def test_a_delay_over_row_and_time_is_the_same_everywhere() -> None:
     motion = row_motion(integrate_gyro(log(), profile), profile, stamp_s, 0.008)
     assert motion.row_time_s(points, 0.5) - even_s == pytest.approx(late_s, abs=2e-5)
     assert late_rows_s(profile, NOTHING, fraction, stamp_s) == pytest.approx(late_s, abs=1e-9)
+
+
+def test_rows_that_start_late_at_long_exposures_do_so_in_a_frame_and_in_the_simulator() -> None:
+    """The last row is late by 0 ms at an exposure of 4 ms, 1 ms at 8 ms and 2 ms at 12 ms."""
+    values = ((0.0,), (0.0,), (0.0,), (0.002,))
+    profile = CAMERA.with_fields([Field("delay", ("row", "exposure"), ((0.0, 1.0), (0.004, 0.012)), values)])
+    points = np.stack([np.zeros(120), np.arange(120.0)], axis=-1)
+    fraction = np.arange(120) / 120
+    for exposure_s, last_s in ((0.003, 0.0), (0.008, 0.001), (0.012, 0.002)):
+        even_s = RowClock(CAMERA).seen_s(points, 0.5, exposure_s)
+        late_s = RowClock(profile).seen_s(points, 0.5, exposure_s) - even_s
+        assert late_s == pytest.approx(last_s * fraction, abs=1e-9)
+        motion = row_motion(integrate_gyro(log(), profile), profile, 0.5, exposure_s)
+        assert motion.row_time_s(points, 0.5) - even_s == pytest.approx(late_s, abs=2e-5)
+        assert late_rows_s(profile, NOTHING, fraction, 0.5, exposure_s) == pytest.approx(late_s, abs=1e-9)
+    assert parse_profile(yaml.safe_load(format_profile(profile))).fields == profile.fields
 
 
 def test_a_simulated_frame_has_the_blur_of_its_field() -> None:

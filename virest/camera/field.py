@@ -5,7 +5,7 @@ which must not fall below 0) and constant beyond the first and last knot.  Two c
 kinds:
 
 - ``delay`` (s): delay of a row relative to an even readout, or of a frame relative to its timestamp (camera clock);
-  with row and time, the time is that of the frame's first row.
+  with row and time, the time is that of the frame's first row; with row and exposure, the exposure is the logged one.
 - ``displacement`` (px): displacement of a point from where the lens model puts it.
 - ``scale`` (1): relative increase of the focal length; over the radius, for points seen there.
 - ``gain`` (1): relative increase of the light at a position of the sensor.
@@ -31,7 +31,7 @@ from virest.errors import SettingsError
 AXES = ("x", "y", "z")
 RATES, FORCES = tuple(f"rate_{a}" for a in AXES), tuple(f"accel_{a}" for a in AXES)
 KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
-    "delay": ("s", 1, (("row",), ("time",), ("row", "time"))),
+    "delay": ("s", 1, (("row",), ("time",), ("row", "time"), ("row", "exposure"))),
     "displacement": ("px", 2, (("x", "y"),)),
     "scale": ("1", 1, (("time",), ("focus",), ("focal",), ("radius", "time"), ("radius", "focus"))),
     "gain": ("1", 1, (("x", "y"),)),
@@ -39,7 +39,7 @@ KINDS: dict[str, tuple[str, int, tuple[tuple[str, ...], ...]]] = {
     "rate": ("rad/s", 3, (("time",), *((name,) for name in (*RATES, *FORCES)), *((name, "time") for name in RATES))),
 }
 """Unit, number of components and possible covariates of each kind."""
-UNITS = {"row": "1", "radius": "px", "x": "px", "y": "px", "time": "s", "focus": "1/m", "focal": "1"}
+UNITS = {"row": "1", "radius": "px", "x": "px", "y": "px", "time": "s", "exposure": "s", "focus": "1/m", "focal": "1"}
 """Units of the covariates; rates are in rad/s, accelerations in m/s².  ``row``: fraction of the readout; ``radius``:
 from the principal point; ``focal``: logged focal length over its median."""
 UNIT_SCALES = {

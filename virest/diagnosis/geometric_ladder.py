@@ -109,10 +109,17 @@ def climb(
 
 
 def climb_on(
-    evidence: Evidence, nominal: CameraProfile, model: Model, accepted: tuple[Accepted, ...]
+    evidence: Evidence,
+    nominal: CameraProfile,
+    model: Model,
+    accepted: tuple[Accepted, ...],
+    among: frozenset[str] | None = None,
 ) -> tuple[Model, tuple[Accepted, ...]]:
-    """One more rung, of single causes, from a model that holds fields: (model, causes), the same where none enters."""
-    context = SearchContext(evidence, nominal, (), FarStart(), one_by_one, in_pairs=False)
+    """One more rung, of single causes, from a model that holds fields: (model, causes), the same where none enters.
+
+    among: names of the causes that may enter; None: all.
+    """
+    context = SearchContext(evidence, nominal, (), FarStart(), one_by_one, among, in_pairs=False)
     step, _, rung = _rung(context, model, list(accepted))
     if step is None:
         return model, accepted

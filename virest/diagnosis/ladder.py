@@ -207,6 +207,7 @@ class DiagnosisSession:
             )
             self.geometric = self.points.climbed(progress)
         self.geometric = self._with_fields(self.light.profile)
+        self.light = with_exposure_of(self.light, self.geometric.model.profile)
         self.findings = offset_as_timestamp(
             self.geometric, findings_of(self.geometric), self.points.observed.exposure_s
         )
@@ -323,6 +324,11 @@ class DiagnosisSession:
             (*self.notes, *self.geometric.notes, *(note for stage in stages for note in stage.notes)),
             tuple(fields),
         )
+
+
+def with_exposure_of(light: PictureVerdict, moved: CameraProfile) -> PictureVerdict:
+    """A verdict on brightness with another profile's exposure scale, whose cause a field may have replaced since."""
+    return replace(light, profile=light.profile.with_shutter(exposure_scale=moved.shutter.exposure_scale))
 
 
 def _needs_fields(points: TrackedPoints, found: GeometricVerdict) -> bool:

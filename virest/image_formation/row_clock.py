@@ -47,14 +47,19 @@ def of_frame(profile: CameraProfile, stamp_s: float, logged_exposure_s: float) -
     begin_s = shutter.first_row_start_s(stamp_s, logged_exposure_s)
     late = np.zeros((len(ROWS), 1)) if shutter.uneven is None else shutter.uneven.at(ROWS)
     fraction = ROWS + late[:, 0] / (shutter.readout_time_s or 1.0)
-    late = late + sum(field.at(fraction, begin_s) for field in changing)
+    late = late + sum(field.at(fraction, _per_frame(field, begin_s, logged_exposure_s)) for field in changing)
     rows = Field("delay", ("row",), (tuple(ROWS.tolist()),), tuple(map(tuple, late.tolist())))
     others = [field for field in profile.fields if field not in changing and field != shutter.uneven]
     return profile.with_fields([*others, rows])
 
 
 def _changing_rows(profile: CameraProfile) -> list[Field]:
-    return [f for f in profile.extensions.field if (f.kind, f.covariates) == ("delay", ("row", "time"))]
+    return [f for f in profile.extensions.field if f.kind == "delay" and f.is_pair]
+
+
+def _per_frame(field: Field, begin_s: Any, logged_exposure_s: Any) -> Any:
+    """A frame's value of the second covariate of rows whose delay changes."""
+    return begin_s if field.covariates[1] == "time" else logged_exposure_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +83,8 @@ class RowClock:
         begin_s = shutter.first_row_start_s(stamp_s, logged_exposure_s)
         first_row_s = self.profile.imu_time_s(begin_s)
         for field in _changing_rows(self.profile):
-            first_row_s = first_row_s + field.at(readout_fraction, begin_s)[..., 0]
+            second = _per_frame(field, begin_s, logged_exposure_s)
+            first_row_s = first_row_s + field.at(readout_fraction, second)[..., 0]
         exposure_s = shutter.true_exposure_s(logged_exposure_s)
         return row_time_s(first_row_s, shutter.readout_time_s, readout_fraction, exposure_s, exposure_share)
 

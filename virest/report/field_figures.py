@@ -19,6 +19,7 @@ SAMPLES, CELLS, ARROWS = 200, 60, 13
 NAMES = {
     "row": "fraction of the readout",
     "time": "time",
+    "exposure": "logged exposure",
     "radius": "distance from the principal point",
     "focus": "focus distance",
     "focal": "logged focal length",

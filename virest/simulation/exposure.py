@@ -107,7 +107,7 @@ def expose(scene: Scene, motion: HandMotion, view: View, first_row_start_s: floa
     start_s = (
         first_row_start_s
         + shutter.readout_time_s * fraction
-        + late_rows_s(view.profile, view.hidden, fraction, first_row_start_s)
+        + late_rows_s(view.profile, view.hidden, fraction, first_row_start_s, exposure_s / shutter.exposure_scale)
     )
     instants_s = _instants(scene, motion, view, start_s, exposure_s)
     weights = hat_weights(instants_s, start_s, exposure_s) * flicker(view.profile, instants_s)[:, None]

@@ -26,6 +26,8 @@ class Hidden:
     """(readout fraction (rows,)) → delay of each row against an even readout."""
     row_delay_at: Callable[[float, Array], Array] | None = None
     """(time of the frame's first row, readout fraction) → a further delay of each row."""
+    row_delay_exposed: Callable[[float, Array], Array] | None = None
+    """(logged exposure in s, readout fraction) → a further delay of each row."""
     clock_s: Callable[[float], float] | None = None
     """(stamp) → delay of the whole frame against the clock model."""
     focal_scale: Callable[[Array], Array] | None = None
@@ -51,16 +53,21 @@ LEAST_BLUR_PX, BLUR_LEVELS = 0.05, 8
 """Standard deviation up to which uniform blur is skipped; blurred copies that spatially varying blur interpolates."""
 
 
-def late_rows_s(profile: CameraProfile, hidden: Hidden, fraction: Array, first_row_s: float) -> Array:
+def late_rows_s(
+    profile: CameraProfile, hidden: Hidden, fraction: Array, first_row_s: float, logged_exposure_s: float = 0.0
+) -> Array:
     """Delay of each row (rows,) against an even readout, by readout fraction; first_row_s: IMU clock."""
     late = np.zeros(len(fraction))
     if profile.shutter.uneven is not None:
         late = late + profile.shutter.uneven.at(fraction)[:, 0]
     begun = fraction + late / (profile.shutter.readout_time_s or 1.0)
     for field in profile.extensions.field:
-        if field.kind == "delay" and field.covariates == ("row", "time"):
-            late = late + field.at(begun, profile.camera_time_s(first_row_s))[:, 0]
-    for hide in (hidden.row_delay_s, hidden.row_delay_at and partial(hidden.row_delay_at, first_row_s)):
+        if field.kind == "delay" and field.is_pair:
+            over_time = field.covariates[1] == "time"
+            late = late + field.at(begun, profile.camera_time_s(first_row_s) if over_time else logged_exposure_s)[:, 0]
+    at = hidden.row_delay_at and partial(hidden.row_delay_at, first_row_s)
+    exposed = hidden.row_delay_exposed and partial(hidden.row_delay_exposed, logged_exposure_s)
+    for hide in (hidden.row_delay_s, at, exposed):
         late = late if hide is None else late + hide(fraction)
     return late
 

@@ -64,6 +64,8 @@ class UnknownEffect:
     """Per field: acceptable pairs of kind and covariates."""
     lasting: bool = True
     """Whether other captures of the phone share the effect."""
+    exposures_s: tuple[float, ...] = ()
+    """Exposures of successive frames; empty: one for all."""
     nameless: bool = False
     """Whether neither a cause nor a field describes it, so that only an unnamed result is right."""
 
@@ -209,6 +211,30 @@ def _changing_readout(rng: np.random.Generator, size: float) -> UnknownEffect:
     return UnknownEffect(hidden, expected=(_either(("delay", "row, time")),), lasting=False)
 
 
+def _exposed_readout(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """A readout that takes longer at long exposures: in proportion to them, or above 8 ms."""
+    part, kind = _sign(rng) * 0.1 * size * rng.uniform(0.8, 1.25), int(rng.integers(2))
+
+    def delay_s(exposure_s: float, fraction: Array) -> Array:
+        return part * fraction * (exposure_s if kind else 0.01 / (1 + np.exp(-(exposure_s - 0.008) / 0.0005)))
+
+    hidden = Hidden(row_delay_exposed=delay_s)
+    exposures_s = tuple(float(e) for e in np.geomspace(0.004, 0.014, 23)[np.arange(23) * 7 % 23])
+    return UnknownEffect(hidden, expected=(_either(("delay", "row, exposure")),), exposures_s=exposures_s)
+
+
+def _drifting_bias(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """A gyroscope whose bias drifts from the given one: evenly, or settling as it warms up."""
+    way, settling_s, kind = rng.normal(size=3), rng.uniform(0.8, 1.6), int(rng.integers(2))
+    change_rad_s = 0.012 * size * rng.uniform(0.8, 1.25) * way / np.linalg.norm(way)
+
+    def drifted(time_s: Array, reading: Array, _force: Array) -> Array:
+        part = time_s * FPS / FRAMES if kind else 1 - np.exp(-np.maximum(time_s, 0) / settling_s)
+        return np.asarray(reading + part[:, None] * change_rad_s)
+
+    return UnknownEffect(Hidden(gyro=drifted), expected=(_either(("rate", "time")),), lasting=False)
+
+
 def _changing_distortion(rng: np.random.Generator, size: float) -> UnknownEffect:
     """Distortion that drifts and settles as the lens warms up."""
     part, settling_s = _sign(rng) * 0.008 * size * rng.uniform(0.8, 1.25), rng.uniform(0.4, 0.9)
@@ -275,6 +301,8 @@ EFFECTS: dict[str, Draw] = {
     "two": _two,
     "one_named": _one_named,
     "passing": _passing,
+    "exposed_readout": _exposed_readout,
+    "drifting_bias": _drifting_bias,
 }
 NULL, NAMED_ONLY = "nothing", "named_only"
 CASES = {**EFFECTS, NULL: _nothing, NAMED_ONLY: _named_only}
@@ -301,11 +329,12 @@ def write_case(folder: Path, name: str, seed: int, *, other: bool = False) -> tu
     )  # fmt: skip
     context = EffectContext(frames, FPS, np.random.default_rng([seed, 16]))
     true, applied = hide_effects(nominal, unknown.effects, context)
+    scene, usual_s = str(rng.choice(SCENES)), float(rng.uniform(0.004, 0.012))
     settings = SessionSettings(
-        scene=str(rng.choice(SCENES)),
+        scene=scene,
         frames=frames,
         fps=FPS,
-        exposure_s=(float(rng.uniform(0.004, 0.012)),),
+        exposure_s=unknown.exposures_s or (usual_s,),
         rate_rad_s=float(rng.uniform(0.6, 1.5)),
         noise_levels=float(rng.uniform(1.0, 3.0)),
         gyro_noise_rad_s=float(rng.uniform(0.0008, 0.0025)),

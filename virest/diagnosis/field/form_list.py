@@ -19,7 +19,8 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import focus_log
 from virest.capture.records import Capture
-from virest.diagnosis.field.forms import FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
+from virest.diagnosis.candidates import varies
+from virest.diagnosis.field.forms import EXPOSURE, FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
 
 ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5
 """Knots of the coarse forms.  The fewer, the weaker an effect they detect: a cubic spline through 4, 5, 6 or 7 knots
@@ -32,6 +33,9 @@ MOST_PLACE_KNOTS = FINE_PLACE_KNOTS + PLACE_KNOTS - 1
 """The same for maps."""
 PAIR_KNOTS = 3
 """Knots over the row or the radius in a pair: a parabola, and 0 at the first knot."""
+MOST_PAIR_KNOTS = {TIME: MOST_KNOTS, EXPOSURE: 4 * PAIR_KNOTS - 3}
+"""Knots over the second covariate of a pair after refinement.  A readout that changes above some exposure does so
+within an eighth of the range."""
 LEAST_TIMES, TIME_STEPS = 4, ((0.4, 12), (0.1, MOST_KNOTS))
 """(knot spacing in s, maximum number of knots) over time, coarse and fine.  0.1 s is 3 frames; a hunting focus has a
 period of 0.5 s."""
@@ -64,12 +68,13 @@ def possible_forms(
     drifts = [_drift_form(kind, knots, stamp, known) for kind in ("scale", "rate")]
     drifts += [_drift_form("delay", stamps, stamp, known), _drift_form("scale", fine, stamp, known, local=True)]
     drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
+    drifts.append(_drift_form("rate", knots[[0, -1]], stamp, known))
     places = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), _off_centre_form(profile)]
     forms = [*places, *drifts]
     forms += step_forms(capture, candidate_steps_s(span_s, capture))
     if profile.shutter.readout_time_s > 0:
         forms += [_row_form(count) for count in (ROW_KNOTS, FINE_ROW_KNOTS)]
-    if (focus := _focus_form(capture)) is not None:
+    if (focus := _focus_form(capture, known)) is not None:
         forms.append(focus)
     forms += [_rate_form(capture.imu, profile), _fine_rate_form(capture.imu, profile, known)]
     if capture.imu.has_accelerometer:
@@ -82,57 +87,63 @@ def forms_of_pairs(
 ) -> list[FieldForm]:
     """Interactions of two covariates: tensor products of a curve along each.
 
-    They are 0 at the first row, at the principal point and at rest, where the effect depends on time or focus alone.
-    They include the part constant over time or focus, unless a cause or a field in the model (known) models it.
+    They are 0 at the first row, at the principal point and at rest, where the effect depends on the other covariate
+    alone.  They include the part constant over that one, unless a cause or a field in the model (known) models it.
     """
     times = _rounded(_times(span_s, *TIME_STEPS[0]))
-    stamp, mean = capture.stamp_0_ns, np.ones((1, len(times)))
+    stamp = capture.stamp_0_ns
     forms = []
     if profile.shutter.readout_time_s > 0:
-        rows = np.linspace(0, 1, PAIR_KNOTS)
+        rows, later = np.linspace(0, 1, PAIR_KNOTS), [np.eye(PAIR_KNOTS)[:, 1:]]
         late = _zero("delay", ("row", TIME), [rows, np.asarray(profile.camera_time_s(times))], stamp)
-        forms.append(_product((late,), [np.eye(len(rows))[:, 1:]], mean, READOUTS, known))
+        forms.append(_product((late,), later, None, READOUTS, known))
+        logged_s = np.array([frame.exposure_s for frame in capture.frames if frame.exposure_s])
+        if len(logged_s) and varies(logged_s):
+            knots = np.linspace(logged_s.min(), logged_s.max(), min(PAIR_KNOTS, len(np.unique(logged_s))))
+            late = _zero("delay", ("row", EXPOSURE), [rows, knots])
+            forms.append(_product((late,), later, logged_s, READOUTS, known))
     radii = np.linspace(0, 0.5 * np.hypot(profile.width, profile.height), PAIR_KNOTS)
     outwards = [np.eye(len(radii))[:, 1:]]
     drawn = _zero("scale", ("radius", TIME), [radii, times], stamp)
-    forms.append(_product((drawn,), outwards, mean, LENSES, known))
-    if (focus := _focus_form(capture)) is not None:
+    forms.append(_product((drawn,), outwards, None, LENSES, known))
+    if (focus := _focus_form(capture, known)) is not None:
         ((dioptres,), log) = focus.fields[0].knots, focus.fields[0].log
         assert log is not None
         drawn = _zero("scale", ("radius", "focus"), [radii, np.array(dioptres)], None, log)
-        typical = cardinal_weights(dioptres, np.array(log[1])).mean(axis=0, keepdims=True)
-        forms.append(_product((drawn,), outwards, typical, LENSES, known))
+        forms.append(_product((drawn,), outwards, np.array(log[1]), LENSES, known))
     reaches = [np.array([-reach, reach]) for reach in _reaches(capture.imu, profile)]
     rates = tuple(_zero("rate", (name, TIME), [ends, times], stamp) for name, ends in zip(RATES, reaches, strict=True))
     odd = [np.array([[-1.0], [1.0]]) / np.sqrt(2)] * 3
-    return [*forms, _product(rates, odd, mean, GYROS, known)]
+    return [*forms, _product(rates, odd, None, GYROS, known)]
 
 
 def _product(
-    fields: tuple[Field, ...], first: list[Array], mean: Array, steady: frozenset[str], known: frozenset[str]
+    fields: tuple[Field, ...], first: list[Array], logged: Array | None, steady: frozenset[str], known: frozenset[str]
 ) -> FieldForm:
     """first: basis along the first covariate of each field; steady: terms that model the constant part.
 
-    If one of these terms is known, the mean (1, knots) over the second covariate is 0.  Each of the 3 rate fields acts
-    on its own axis.
+    If one of these terms is known, the mean over the second covariate is 0.  logged: its values; None: it is the time,
+    evenly spread.  Each of the 3 rate fields acts on its own axis.
     """
-    changing = null_space(mean) if known & steady else np.eye(mean.shape[1])
-    more = 2 * mean.shape[1] - 1
+    second, knots = fields[0].covariates[1], fields[0].knots[1]
+    weights = np.ones((1, len(knots))) if logged is None else cardinal_weights(knots, logged)
+    changing = null_space(weights.mean(axis=0, keepdims=True)) if known & steady else np.eye(len(knots))
+    more = 2 * len(knots) - 1
     refine: Recipe | None = None
-    if fields[0].covariates[1] == TIME and more <= MOST_KNOTS:
-        finer = tuple(_with_times(field, more) for field in fields)
-        refine = lambda _profile, now: _product(finer, first, np.ones((1, more)), steady, now)  # noqa: E731
+    if second in MOST_PAIR_KNOTS and more <= MOST_PAIR_KNOTS[second]:
+        finer = tuple(_with_knots(field, more) for field in fields)
+        refine = lambda _profile, now: _product(finer, first, logged, steady, now)  # noqa: E731
     axes = np.eye(len(fields))
     bases = [np.kron(np.kron(along, changing), axes[:, k : k + 1]) for k, along in enumerate(first)]
-    again: Recipe = lambda _profile, now: _product(fields, first, mean, steady, now)  # noqa: E731
+    again: Recipe = lambda _profile, now: _product(fields, first, logged, steady, now)  # noqa: E731
     return FieldForm(fields, np.asarray(block_diag(*bases)), build=again, refine=refine)
 
 
-def _with_times(field: Field, count: int) -> Field:
-    """The same field with this many knots over time and value 0 everywhere."""
-    first, times = field.knots
+def _with_knots(field: Field, count: int) -> Field:
+    """The same field with this many even knots over its second covariate and value 0 everywhere."""
+    first, second = field.knots
     return _zero(
-        field.kind, field.covariates, [np.array(first), np.linspace(times[0], times[-1], count)], field.stamp_0_ns
+        field.kind, field.covariates, [np.array(first), np.linspace(second[0], second[-1], count)], field.stamp_0_ns
     )
 
 
@@ -214,9 +225,10 @@ def _off_centre_form(profile: CameraProfile) -> FieldForm:
 def _drift_form(
     kind: str, knots: Array, stamp_0_ns: int | None, known: frozenset[str], local: bool = False
 ) -> FieldForm:
-    """Over time: a focal length relative to its start, rates about their mean (bias), or a delay.
+    """Over time: a focal length relative to its start, rates, or a delay.
 
-    If a clock offset or skew is in the model, the delay has no mean or slope, respectively.
+    If a bias is in the model, the rates have no mean.  If a clock offset or skew is, the delay has no mean or slope,
+    respectively.
     """
     count, field = len(knots), _zero(kind, (TIME,), [knots], stamp_0_ns)
 
@@ -227,7 +239,7 @@ def _drift_form(
     if kind == "scale":
         free = free[:, 1:]
     elif kind == "rate":
-        free = np.kron(null_space(np.ones((1, count))), np.eye(3))
+        free = np.kron(null_space(np.ones((1, count))) if "gyro_bias" in known else free, np.eye(3))
     else:
         line = {"time_offset": np.ones(count), "clock_skew": np.linspace(-1, 1, count)}
         held = [row for name, row in line.items() if name in known]
@@ -251,8 +263,11 @@ def candidate_steps_s(span_s: tuple[float, float], capture: Capture) -> Array:
     return np.linspace(*span_s, min(frames // FRAMES_PER_STEP, MOST_STEPS) + 2)[1:-1]
 
 
-def _focus_form(capture: Capture) -> FieldForm | None:
-    """Over the logged focus distance, relative to the start of the capture."""
+def _focus_form(capture: Capture, known: frozenset[str]) -> FieldForm | None:
+    """Over the logged focus distance; relative to the start of the capture if the focal length is in the model.
+
+    The given focal length holds at an unknown focus distance, so the level is the field's.
+    """
     log = focus_log(capture)
     if log is None or len(log[0]) < 0.5 * len(capture.frames):
         return None
@@ -261,7 +276,13 @@ def _focus_form(capture: Capture) -> FieldForm | None:
         return None
     knots: Array = np.unique(np.round(np.linspace(values.min(), values.max(), FOCUS_KNOTS), 6))
     field = _zero("scale", ("focus",), [knots], None, log)
-    return FieldForm((field,), null_space(cardinal_weights(field.knots[0], values[0])[None]))
+    return _breathing_form(field, float(values[0]), known)
+
+
+def _breathing_form(field: Field, start: float, known: frozenset[str]) -> FieldForm:
+    at_start = cardinal_weights(field.knots[0], start)[None]
+    free = null_space(at_start) if "focal_length" in known else np.eye(at_start.shape[1])
+    return FieldForm((field,), free, build=lambda _profile, now: _breathing_form(field, start, now))
 
 
 def _rate_form(imu: ImuSamples, profile: CameraProfile) -> FieldForm:

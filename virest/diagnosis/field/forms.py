@@ -26,7 +26,7 @@ STD = {"delay": 0.01, "displacement": 30.0, "scale": 0.2, "rate": 1.0}
 """Prior σ of a free number, 10 times the usual size in phones: it only regularises undetermined numbers."""
 QUOTIENT = {"delay": 1e-4, "displacement": 0.1, "scale": 1e-4, "rate": 2e-3}
 """Step of the difference quotients, in the unit of the values."""
-TIME, OVER = "time", " over "
+TIME, EXPOSURE, OVER = "time", "exposure", " over "
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class FieldForm:
     @property
     def over_time(self) -> bool:
         """Whether it has one value per frame, known only where it was fitted."""
-        return bool(set(self.covariates) & {TIME, "focus"})
+        return bool(set(self.covariates) & {TIME, "focus", EXPOSURE})
 
     def is_dense(self, step_s: float) -> bool:
         """Whether its knots over time are closer than this, so that frames hardly predict those between them."""
@@ -119,6 +119,14 @@ class FieldForm:
     def removed_from(self, profile: CameraProfile) -> CameraProfile:
         """The profile without these fields."""
         return profile.with_fields([f for f in profile.fields if not any(map(f.is_in_place_of, self.fields))])
+
+    def can_hold(self, profile: CameraProfile) -> bool:
+        """Whether the values that a profile has for its fields are values of this form."""
+        values = np.concatenate([np.ravel(self.held_in(profile, field).values) for field in self.fields])
+        if len(values) != len(self.basis):
+            return False
+        beyond = values - self.basis @ (self.basis.T @ values)
+        return float(np.abs(beyond).max(initial=0.0)) < 1e-9 * max(float(np.abs(values).max(initial=0.0)), 1e-12)
 
     @staticmethod
     def held_in(profile: CameraProfile, field: Field) -> Field:

@@ -18,6 +18,7 @@ from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals, point_residuals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
 from virest.diagnosis.field.forms import OVER, STD, FieldForm
+from virest.diagnosis.field.levels import given_value_p, level_cause
 from virest.diagnosis.field.records import FittedField
 from virest.diagnosis.field.screening import (
     MIN_BLOCKS,
@@ -31,6 +32,7 @@ from virest.diagnosis.field.screening import (
     select,
 )
 from virest.diagnosis.field.sudden import SuddenChange, best_instant, bias_step, lasting_change, sudden_change
+from virest.diagnosis.geometric_effects import GeometricEffect, geometric_effect
 from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
     EXCESS_SCALE,
@@ -42,6 +44,7 @@ from virest.diagnosis.geometric_ladder import (
     climb_on,
     p_of,
 )
+from virest.diagnosis.selection import POINT_LEVELS
 from virest.diagnosis.structure import STRUCTURE_NOISES
 from virest.inference.chance import beyond_noise, t_ratio
 from virest.inference.track_fit import Term, TrackFit, fit_from
@@ -154,10 +157,14 @@ class _SearchState:
         """Whether any form has knots as dense as the blocks at this frame period."""
         return any(form.is_dense(2 * PAIRS_IN_BLOCK * period_s) for form in self.forms)
 
-    def without(self, found: GeometricVerdict, leaving: Sequence[Accepted]) -> _SearchState:
+    def without(
+        self, found: GeometricVerdict, leaving: Sequence[Accepted], known: frozenset[str] = frozenset()
+    ) -> _SearchState:
         """The same without some causes, whose parameters return to their nominal values.
 
-        Forms that depend on these causes, such as a displacement on the principal point, restart from 0.
+        known: names of causes to which forms leave their level even without them in the model.
+        Forms that depend on these causes restart from 0 if they cannot hold their values: a displacement about another
+        principal point.
         """
         model = self.model
         for entry in leaving:
@@ -170,13 +177,22 @@ class _SearchState:
             back = -entry.effect.total_change(found.nominal.profile, model.profile)
             terms: Sequence[Term] = [term for term in model.terms if term.name != name]
             model = replace(model, profile=entry.effect.term.change(model.profile, back), terms=tuple(terms))
-        names = frozenset(term.name for term in model.terms)
+        names = known | {term.name for term in model.terms}
         forms = tuple(form.about(model.profile, names) for form in self.forms)
-        for old, new in zip(self.forms, forms, strict=True):
-            if old is not new:
-                less = _without_form(model, old)
-                model = replace(less, terms=(*less.terms, new.term))
+        model = _restarted(model, self.forms, forms)
         return _SearchState(model, tuple(entry for entry in self.accepted if entry not in leaving), forms)
+
+    def frees_level(self, form: FieldForm, cause: str) -> bool:
+        """Whether a form takes over the level if a cause leaves."""
+        names = frozenset(term.name for term in self.model.terms if term.name != cause)
+        return form.about(self.model.profile, names).basis.shape[1] > form.basis.shape[1]
+
+    def level_left_to(self, cause: str) -> _SearchState:
+        """The same with forms that leave their level to a cause; these restart from 0."""
+        model = self.model
+        names = frozenset({cause, *(term.name for term in model.terms)})
+        forms = tuple(form.about(model.profile, names) for form in self.forms)
+        return _SearchState(_restarted(model, self.forms, forms), self.accepted, forms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,11 +244,18 @@ def _step(
     gained_px = np.sqrt(max(entered.before.rms**2 - left**2, 0.0)) * typical
     shared_px = STRUCTURE_NOISES * left * typical if entered.form.local else 0.0
     small = gained_px < max(MIN_SIZE_PX if proposal.selection else 0.0, shared_px)
-    return (
-        None
-        if (small or proposal.instead) and len(after.accepted) == len(state.accepted)
-        else (proposal, entered, after)
-    )
+    if small or proposal.instead:
+        replaces = len(after.accepted) < len(state.accepted)
+        if not replaces or not _is_better(judged, after.model, entered.form):
+            return None
+    return proposal, entered, after
+
+
+def _is_better(judged: _Judged, model: Model, form: FieldForm) -> bool:
+    """Whether a model with a form predicts held-out data better than the judged one by RIVAL_T standard errors."""
+    after = _held_out(judged.evidence, model, judged.fitted, form.local)
+    gain = judged.held_out(form.local).block_loss - after.block_loss
+    return _holds_over_time(gain) if form.over_time and not form.local else t_ratio(gain) > RIVAL_T
 
 
 @dataclass(frozen=True, slots=True)
@@ -437,6 +460,16 @@ def _without_form(model: Model, form: FieldForm) -> Model:
     return replace(model, profile=form.removed_from(model.profile), terms=terms)
 
 
+def _restarted(model: Model, old: Sequence[FieldForm], new: Sequence[FieldForm]) -> Model:
+    """The model with new forms in place of old ones; those that cannot hold their values restart from 0."""
+    for before, after in zip(old, new, strict=True):
+        if before is not after:
+            less = _without_form(model, before)
+            profile = model.profile if after.can_hold(model.profile) else less.profile
+            model = replace(less, profile=profile, terms=(*less.terms, after.term))
+    return model
+
+
 def _held_out(evidence: Evidence, model: Model, scaled: TrackFit, by_point: bool = False) -> HeldOut:
     """Fit on every other block of a few pairs, judge on the remaining blocks, and vice versa.
 
@@ -483,6 +516,7 @@ def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _Sear
     gyroscope that feels gravity.  Nothing is sought where the residuals are noise.
     """
     fitted = evidence.fit(state.model, state.model.terms, evidence.table(state.model, JUDGE_POINTS))
+    state = _with_level_cause(evidence, found, state, fitted)
     if fitted.scale < EXCESS_SCALE:
         return state
     model, accepted = climb_on(evidence, found.nominal.profile, state.model, state.accepted)
@@ -491,12 +525,38 @@ def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _Sear
     return _without_redundant_causes(evidence, found, replace(state, model=model, accepted=accepted))
 
 
+def _with_level_cause(
+    evidence: Evidence, found: GeometricVerdict, state: _SearchState, fitted: TrackFit
+) -> _SearchState:
+    """Add the cause of a field's level where the given value lies outside the field's range; else unchanged."""
+    form = state.forms[-1]
+    name = level_cause(form)
+    if name is None or name in {term.name for term in state.model.terms}:
+        return state
+    if not _is_outside(evidence, found, fitted, form, geometric_effect(name)):
+        return state
+    left = state.level_left_to(name)
+    model, accepted = climb_on(evidence, found.nominal.profile, left.model, left.accepted, frozenset({name}))
+    return state if len(accepted) == len(state.accepted) else replace(left, model=model, accepted=accepted)
+
+
+def _is_outside(
+    evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, form: FieldForm, effect: GeometricEffect
+) -> bool:
+    """Whether the given value of the cause of a field's level lies outside the field's range."""
+    given = found.nominal.profile
+    return POINT_LEVELS.significant(given_value_p(fitted, form, effect, given, evidence.typical_px))
+
+
 def _loses_without(judged: _Judged, by_point: bool, less: Model) -> bool:
     """Whether the cause or form that a smaller model lacks improves held-out blocks, or points."""
     before, after = _held_out(judged.evidence, less, judged.fitted, by_point), judged.held_out(by_point)
     gain = before.block_loss - after.block_loss
     part = float(gain.mean() / before.block_loss.mean())
-    return part > MIN_GAIN and t_ratio(gain) > (MIN_LOCAL_T if part > LARGE_GAIN else MIN_T)
+    if part > LARGE_GAIN:
+        # as much as entered the model may lie in a few blocks
+        return t_ratio(gain) > MIN_LOCAL_T if by_point else _holds_over_time(gain)
+    return part > MIN_GAIN and t_ratio(gain) > MIN_T
 
 
 def _redundant_form(judged: _Judged, state: _SearchState) -> FieldForm | None:
@@ -514,10 +574,34 @@ def _redundant_causes(judged: _Judged, found: GeometricVerdict, state: _SearchSt
     if fitting:
         p_values = {entry.name: _p_value_of(judged.evidence, found, judged.fitted, entry) for entry in fitting}
         weakest = [(max(fitting, key=lambda entry: p_values[entry.name]),)]
+    outside, inside = _level_causes(judged, found, state, fitting)
+    if inside:
+        return inside[:1]
     for leaving in (*depth, *weakest, *combinations(fitting, 2)):
-        if not _loses_without(judged, state.is_dense(judged.evidence.period_s), state.without(found, leaving).model):
+        less = state.without(found, leaving, outside).model
+        if not _loses_without(judged, state.is_dense(judged.evidence.period_s), less):
             return leaving
     return ()
+
+
+def _level_causes(
+    judged: _Judged, found: GeometricVerdict, state: _SearchState, causes: Sequence[Accepted]
+) -> tuple[frozenset[str], tuple[Accepted, ...]]:
+    """Among causes of the levels of fields: (names of those with given values outside the range, those inside).
+
+    A cause inside needs no test: the field describes the same with its own level.
+    """
+    outside: set[str] = set()
+    inside: list[Accepted] = []
+    for entry in causes:
+        assert entry.effect is not None
+        forms = [form for form in state.forms if level_cause(form) == entry.name]
+        forms = [form for form in forms if state.frees_level(form, entry.name)]
+        if any(_is_outside(judged.evidence, found, judged.fitted, form, entry.effect) for form in forms):
+            outside.add(entry.name)
+        elif forms:
+            inside.append(entry)
+    return frozenset(outside), tuple(inside)
 
 
 def _p_value_of(evidence: Evidence, found: GeometricVerdict, fitted: TrackFit, entry: Accepted) -> float:

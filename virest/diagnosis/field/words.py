@@ -89,6 +89,13 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "a sensor that changes its mode or clock while it films, or a picture that is cropped and scaled as it goes",
         "film a light that flickers at a known rate: its bands grow closer where the readout takes longer",
     ),
+    ("delay", ("row", "exposure")): Pattern(
+        "rows are {lateness} by up to {size} at some exposures and not at others, {shape}: "
+        "the readout changes with the exposure",
+        "a sensor that lengthens its lines for long exposures, or combines several exposures to one frame",
+        "film a light that flickers at a known rate at several fixed exposures: its bands grow closer where the "
+        "readout takes longer",
+    ),
     ("scale", ("radius", "time")): Pattern(
         "the magnification towards the edges changes by up to {size} over time, {shape}: its distortion changes",
         "a lens that warms up or refocuses without logging it, or a phone that corrects distortion frame by frame",
