@@ -121,7 +121,7 @@ def _explained(capture: Capture, profile: CameraProfile, table: TrackTable) -> _
         return np.asarray(np.linalg.solve(pulled @ columns, pulled @ apart_px.ravel()))
 
     lag_s = float(fitted(late)[1]), float(fitted([*late, *-ways])[1])
-    return _Pulls(fitted(-ways), unit_px, lag_s, float(np.median(noise_px)))
+    return _Pulls(fitted([*-ways]), unit_px, lag_s, float(np.median(noise_px)))
 
 
 def _size(vectors: Array) -> Array:
