@@ -14,8 +14,8 @@ from virest.calibration.geometry import GeometryCalibration
 from virest.camera.profile_file import read_profile
 
 
-def _row(ratio: float, shared: float = 0.5) -> dict[str, object]:
-    return {"value": "k1", "error": ratio, "std": 1.0, "shared_std": shared, "error_in_std": ratio}
+def _row(ratio: float, shared: float = 0.5, blur: float = 0.5) -> dict[str, object]:
+    return {"value": "k1", "error": ratio, "std": 1.0, "shared_std": shared, "blur_std": blur, "error_in_std": ratio}
 
 
 def test_errors_are_summarised() -> None:
@@ -33,6 +33,19 @@ def test_errors_are_summarised() -> None:
     np.testing.assert_allclose(shares, expected, rtol=0.15)
 
 
+def test_the_parts_of_the_deviation_are_found_by_their_likelihood() -> None:
+    """Rows in which one part or the other dominates separate the two."""
+    rng = np.random.default_rng(2)
+    kinds = ((0.9, 0.1), (0.1, 0.9), (0.1, 0.1))
+    rows = []
+    for shared, blur in kinds:
+        wide = np.sqrt(1 + 3 * shared**2 - 0.75 * blur**2)
+        rows += [_row(wide * r, shared, blur) for r in rng.normal(size=1500)]
+    share, left = calibration.most_likely(rows)
+    assert share == pytest.approx(2 * calibration.EVEN_SHARED, rel=0.2)
+    assert left == pytest.approx(calibration.LEFT_BY_EVEN_BLUR / 2, abs=0.051)
+
+
 def test_the_section_writes_a_table_and_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each seed from the first reserved one gives one capture; rejected captures leave no row."""
     seeds: list[int] = []
@@ -45,6 +58,7 @@ def test_the_section_writes_a_table_and_a_figure(tmp_path: Path, monkeypatch: py
     facts, text = calibration.calibration_section(tmp_path, Scale(seeds=3, figures=tmp_path))
     assert seeds == [calibration.FIRST_SEED + k for k in range(3)]
     assert "3 simulated captures" in text
+    assert "most likely for all values" in text
     assert facts["summary"]["k1"]["count"] == 4
     assert (tmp_path / calibration.FIGURE).read_bytes().startswith(b"\x89PNG")
 

@@ -7,12 +7,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from motion.synthetic_tracks import Setup, recorded
 
 from virest.camera.response import ResponseCurve
-from virest.inference.blur_bias import matched_shift_px
+from virest.image_formation.point_model import integrate_motion, seen_s
+from virest.inference.blur_bias import matched_shift_px, rolling_shift_px
 from virest.inference.even_blur import BlurPath, EvenMap
 from virest.inference.guidance import NODES, MapBetween, applied_blur, interpolated
 from virest.inference.tracking import track_pairs
+from virest.motion.trajectory import turned
 
 Array = np.ndarray
 SIDE, MARGIN, PAIRS, INSTANTS = 288, 32, 30, 24
@@ -189,3 +192,31 @@ def _blurred(texture: Array, path: Array) -> Array:
     light = np.fft.irfft2(spectrum * (down @ across.T / len(path)), s=texture.shape)
     grey = 255 * np.clip(light, 0, 1) ** (1 / 2.2)
     return np.rint(grey).astype(np.uint8)[MARGIN:-MARGIN, MARGIN:-MARGIN].copy()
+
+
+@pytest.mark.parametrize("direction", ["top_to_bottom", "right_to_left"])
+def test_rows_that_are_read_while_points_move_shift_them(direction: str) -> None:
+    """The mean of a point over the time for which its rows are exposed, beside that of its middle row."""
+    recording = recorded(Setup(seed=21, readout_direction=direction, frames=12, gyro_noise_rad_s=0.0))
+    profile, table = recording.profile, recording.table()
+    table = table.chosen(np.arange(len(table)) % 5 == 0)
+    known, half_s = integrate_motion(recording.imu, profile, translation=False), 0.01
+    at = table.first_stamp_s, np.full(len(table), 2 * half_s / profile.shutter.exposure_scale)
+    middle_s = seen_s(profile, table.first_px, *at)
+    world = turned(known.trajectory.orientation(middle_s), known.lens.rays(table.first_px, middle_s))
+
+    def seen(time_s: Array) -> Array:
+        back = np.swapaxes(known.trajectory.orientation(time_s), -1, -2)
+        return known.lens.project(turned(back, world), time_s)
+
+    since_s = half_s * np.linspace(-1.6, 1.6, 321)
+    paths = [seen(middle_s + since) for since in since_s]
+    late_s = [middle_s + since - seen_s(profile, px, *at) for since, px in zip(since_s, paths, strict=True)]
+    exposed = np.clip((half_s - np.abs(late_s)) / np.diff(since_s)[0] + 0.5, 0.0, 1.0)
+    mean_px = np.average(paths, axis=0, weights=np.broadcast_to(exposed[..., None], np.shape(paths)))
+    row_s = seen_s(profile, mean_px, *at)
+    at_once = np.mean([seen(row_s + half_s * share) for share in (2 * np.arange(100) + 1) / 100 - 1], axis=0)
+    shift_px = mean_px - at_once
+    found_px = rolling_shift_px(known, mean_px, *at)
+    assert np.abs(shift_px).max() > 0.01
+    assert np.sqrt(np.mean((found_px - shift_px) ** 2)) < 0.25 * np.sqrt(np.mean(shift_px**2))

@@ -39,7 +39,7 @@ from virest.errors import CalibrationError
 from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
-from virest.inference.blur_bias import LEFT_BY_EVEN_BLUR, RELATIVE_STD, blur_bias_px
+from virest.inference.blur_bias import LEFT_BY_EVEN_BLUR, RELATIVE_STD, blur_bias_px, rolling_shift_px
 from virest.inference.chance import student_tail
 from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.coded_motion import coding_bias_px
@@ -428,6 +428,7 @@ def _fit_jointly(
     if isinstance(fit.scene, InertialMotion):
         errors_px.append(path_errors_px(imu, fit.integrated, table, fit.scene))
     if corrected:  # without an accelerometer the blur due to translation is unknown
+        table = _in_the_mean_of_rows(fit, table)
         guided = np.array([pair.guided for pair in observed.pairs])
         blur_px = blur_bias_px(fit.integrated, table, guided)
         coding_px = coding_bias_px(fit.integrated, table, fit.scene)
@@ -439,6 +440,13 @@ def _fit_jointly(
     vary = observed.exposure_known and float(np.ptp(observed.exposure_s)) > CONSTANT_EXPOSURE_S
     held = held_values(imu, table, fit, float(np.median(observed.noise_px)), vary)
     return _Joint(fit, table, observed, excluded, corrected, even_blur, held)
+
+
+def _in_the_mean_of_rows(fit: TrackFit, table: TrackTable) -> TrackTable:
+    """The points at which a readout without motion along its rows would have seen them."""
+    first_px = rolling_shift_px(fit.integrated, table.first_px, table.first_stamp_s, table.first_exposure_s)
+    second_px = rolling_shift_px(fit.integrated, table.second_px, table.second_stamp_s, table.second_exposure_s)
+    return replace(table, first_px=table.first_px - first_px, second_px=table.second_px - second_px)
 
 
 # ── conclusions ──────────────────────────────────────────────────────────────────────────────────────────────────

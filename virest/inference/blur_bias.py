@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from virest.arrays import Array, Index, Mask
+from virest.camera.profile import CameraProfile
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, seen_s
 from virest.inference.guidance import applied_blur
 from virest.inference.tracking import TrackingSettings, shrink_factor
@@ -32,8 +33,10 @@ from virest.motion.trajectory import turned
 RELATIVE_STD = 0.35
 """Relative standard deviation of e, because textures differ."""
 LEFT_BY_EVEN_BLUR = 0.3
-"""Standard deviation of the part of e that :mod:`virest.inference.even_blur` leaves: the most likely in 48 captures
-drawn like those of ``python -m virest.app.bench --only calibration`` is 0.35; 0.25 and 0.45 are half as likely."""
+"""Standard deviation of the part of e that :mod:`virest.inference.even_blur` leaves.  In 45 captures drawn by
+``virest.app.bench.calibration.drawn_capture`` (seeds 1 to 18 and 2500 to 2526) 0.1 is the most likely for all values,
+but then the median error of an exposure scale, which depends on blur most, is 1.1 deviations, and 0.8 with 0.3.
+``python -m virest.app.bench --only calibration`` prints the most likely for its captures."""
 DIRECTIONS, RADII, HIGHEST = 8, 10, 0.4
 """Samples of the frequency plane; HIGHEST in cycles per pixel: the pixel aperture suppresses higher frequencies."""
 NODES = 15
@@ -42,6 +45,8 @@ MOST_SHIFT_PX = 0.3
 """Larger e are clipped to this: the first order holds for shifts that are small relative to a corner's detail."""
 LEAST_BLUR_PX = 0.3
 """Points with less blur in both frames together have no bias."""
+SHORTEST_S = 1e-6
+"""Guard against a division by zero: a half exposure, where it is unknown."""
 LEAST_COMMON = 0.5
 """If a smaller fraction of the detail has the same sign in both frames, |Re| replaces Re, so that e stays finite."""
 POINTS_AT_ONCE = 2000
@@ -72,6 +77,29 @@ def blur_bias_px(known: IntegratedMotion, table: TrackTable, guided: Mask) -> Ar
         first, second = ((speed[part], bend[part]) for speed, bend in paths)
         found[part] = factor * matched_shift_px(first, second, added[part])
     return found
+
+
+def rolling_shift_px(known: IntegratedMotion, points_px: Array, stamp_s: Array, exposure_s: Array) -> Array:
+    """Shift (n, 2), px, of blurred points from the mean of the forward model, because rows are read while they move.
+
+    A point that moves with the velocity v, and v_a along the readout, is exposed for 1 / (1 - v_a ρ) times its row's
+    exposure E, ρ being the time from row to row, and differently long before and after the middle if it accelerates.
+    To first order in v_a ρ, its mean then lies ρ E² / 12 d/dt (v v_a) further: 0.1 px at 24 px of blur, a readout of
+    20 ms and 30000 px/s².
+    """
+    profile = known.profile
+    half_s = np.maximum(0.5 * profile.shutter.true_exposure_s(exposure_s), SHORTEST_S)
+    speed, bend = _path(known, points_px, seen_s(profile, points_px, stamp_s, exposure_s), half_s)
+    late = late_per_exposure(profile, points_px, stamp_s, half_s)
+    crossed, bent = ((vector * late).sum(axis=-1, keepdims=True) for vector in (speed, bend))
+    return np.asarray(np.clip(2 / 3 * (speed * bent + bend * crossed), -MOST_SHIFT_PX, MOST_SHIFT_PX))
+
+
+def late_per_exposure(profile: CameraProfile, points_px: Array, stamp_s: Array, half_s: Array) -> Array:
+    """Time (n, 2) by which the next pixels to the right and below are read later, in half exposures (n,)."""
+    at_s = seen_s(profile, points_px, stamp_s, 2 * half_s)
+    later_s = [seen_s(profile, points_px + way, stamp_s, 2 * half_s) - at_s for way in np.eye(2)]
+    return np.stack(later_s, axis=-1) / half_s[:, None]
 
 
 def matched_shift_px(first: tuple[Any, Any], second: tuple[Any, Any], added: Array | None = None) -> Array:

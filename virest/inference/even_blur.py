@@ -17,6 +17,7 @@ from virest.arrays import Array, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.records import Capture
 from virest.image_formation.point_model import TrackTable, predict
+from virest.inference.blur_bias import SHORTEST_S, late_per_exposure
 from virest.inference.guidance import GyroGuide, MapBetween, SmoothField, gyro_guide, interpolated, nodes_px
 from virest.inference.observed_tracks import track_table
 from virest.inference.track_fit import TrackFit
@@ -27,6 +28,8 @@ LEAST_BLUR_PX = 0.3
 """Shorter paths are not applied: as bent as they are long, they bias a match by up to 0.0004 px."""
 FEWEST_SAMPLES, MOST_SAMPLES = 3, 32
 """Samples of a path: one for each pixel of its length within these limits."""
+LEAST_SHARE = 0.5
+"""Points that move along the readout are exposed for at most twice their row's exposure; faster ones get lost."""
 INSTANTS = np.array([-1.0, -0.5, 0.5, 1.0])
 """Instants of the exposure through which a path is interpolated, beside its middle."""
 WHITE_LEVEL = 255.0
@@ -102,7 +105,10 @@ class EvenGuide:
         return EvenMap(between, paths[0], paths[1], self.gyro.known.profile.curve)
 
     def _path(self, frame: int, at_px: Array, shape: tuple[int, int], factor: int) -> BlurPath:
-        """A frame's blur path, through the points that are at the nodes in the middle of their rows' exposure."""
+        """A frame's blur path, through the points that are at the nodes in the middle of their rows' exposure.
+
+        Points that move along the readout are exposed for longer (:func:`virest.inference.blur_bias.rolling_shift_px`).
+        """
         gyro = self.gyro
         table = track_table([TrackPair(frame, frame, at_px, at_px)], gyro.stamp_s, gyro.exposure_s, np.ones(1))
         window = int(np.argmin(np.abs(self.origin_s - gyro.stamp_s[frame])))
@@ -112,9 +118,13 @@ class EvenGuide:
             predict(gyro.known, replace(table, second_stamp_s=table.second_stamp_s + u * half_s), self.scene).second_px
             for u in INSTANTS
         ]) - at_px  # fmt: skip
-        powers = INSTANTS[:, None] ** np.arange(1, len(INSTANTS) + 1)
-        terms = np.einsum("kj,jni->kni", np.linalg.inv(powers), moved / factor)
-        length_px = float(np.linalg.norm(np.diff(moved, axis=0), axis=-1).sum(axis=0).max()) / factor
+        late = late_per_exposure(gyro.known.profile, at_px, table.first_stamp_s, np.maximum(half_s, SHORTEST_S))
+        crossed = (0.5 * (moved[-1] - moved[0]) * late).sum(axis=-1)
+        longer = 1 / np.maximum(1 - crossed, LEAST_SHARE)
+        order = np.arange(1, len(INSTANTS) + 1)
+        terms = np.einsum("kj,jni->kni", np.linalg.inv(INSTANTS[:, None] ** order), moved / factor)
+        terms *= (longer ** order[:, None])[..., None]
+        length_px = float((longer * np.linalg.norm(np.diff(moved, axis=0), axis=-1).sum(axis=0)).max()) / factor
         return BlurPath(tuple(interpolated(term, shape) for term in terms), length_px)
 
 

@@ -77,9 +77,9 @@ def bias_std(fit: TrackFit, name: str, noise_px: float) -> Array:
 # ── points from equally blurred frames, without the encoder's mean bias ──────────────────────────────────────────
 
 EVEN_SHARED = 0.006
-"""Fraction of a step's noise that is correlated with a value's own pattern, the most likely one for all values in 48
-captures drawn like those of ``python -m virest.app.bench --only calibration``; that command prints the fraction that
-its captures imply for each value."""
+"""Fraction of a step's noise that is correlated with a value's own pattern: the largest that is not half as likely as
+the most likely one (0.004) for all values in the 45 captures of :data:`virest.inference.blur_bias.LEFT_BY_EVEN_BLUR`.
+``python -m virest.app.bench --only calibration`` prints what its captures imply."""
 GYRO_WANDER_RAD_S = 5e-5
 """Bias instability of phones' gyroscopes: 10 degrees an hour (data sheets of BMI160, LSM6DSO, ICM-20602: 3 to 10)."""
 

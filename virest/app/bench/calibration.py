@@ -6,13 +6,15 @@ lens, orientation.  Seeds below FIRST_SEED are reserved for choosing constants.
 For each value the table shows median |error| / deviation (0.67 where deviations hold), the fraction of errors within
 two deviations (0.95), the mean error in deviations, which a bias moves from 0, and a histogram.  "share" is the
 fraction of a step's noise that is correlated with the value's own pattern: the one that these errors imply (with it
-the median would be 0.67) and the one that :data:`virest.inference.tracking_bias.EVEN_SHARED` uses.
+the median would be 0.67) and the one that :data:`virest.inference.tracking_bias.EVEN_SHARED` uses.  The last line gives
+the most likely one for all values, with the part of the blur's bias that equally blurred frames leave.
 """
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from virest.calibration.geometry import GeometryCalibration
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import read_profile
 from virest.errors import VirestError
+from virest.inference.blur_bias import LEFT_BY_EVEN_BLUR
 from virest.inference.robust import NORMAL_MEDIAN
 from virest.inference.tracking_bias import EVEN_SHARED, shared_std
 from virest.report.figures import deviation_figure
@@ -42,6 +45,10 @@ HIDDEN = ("time_offset", "readout_time", "gyro_bias", "imu_rotation", "focal_len
 SCENES = ("leaves", "text", "board", "photographs")
 FIRST_SEED = 2001
 """First of this section's seeds."""
+SHARES, LEFTS = np.arange(0.0, 0.0151, 0.001), np.arange(0.0, 0.51, 0.05)
+"""Shared fractions and parts of the blur's bias of which the most likely are sought."""
+LEAST_REST = 0.01
+"""Smallest part of a variance that is neither of them."""
 FIGURE = "calibration.png"
 BINS = np.array([-np.inf, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0, np.inf])
 """Edges of the printed histogram of e / σ, with the tails beyond 3 σ apart."""
@@ -60,7 +67,12 @@ def calibration_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         ratios = {name: [row["error_in_std"] for row in rows if row["value"] == name] for name in names}
         title = f"Errors of calibrate in standard deviations, {seeds} simulated captures"
         (scale.figures / FIGURE).write_bytes(deviation_figure(ratios, title))
-    return {"summary": summary, "rows": rows}, f"Deviations of calibrate: {seeds} simulated captures\n{text}"
+    share, left = most_likely(rows)
+    closing = (
+        f"most likely for all values: share {share:.3f} ({EVEN_SHARED:.3f} used), "
+        f"blur left {left:.2f} ({LEFT_BY_EVEN_BLUR:.2f} used)"
+    )
+    return {"summary": summary, "rows": rows}, f"Deviations of calibrate: {seeds} simulated captures\n{text}\n{closing}"
 
 
 def drawn_capture(seed: int) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]:
@@ -118,9 +130,11 @@ def errors_of(found: GeometryCalibration, truth: CameraProfile) -> list[Row]:
         errors, stds = (np.atleast_1d(np.asarray(v, float)) for v in (difference, value.std))
         name, unit = _TERMS[value.name]
         shared = unit(found.profile) * shared_std(found.fit, name)
+        blurred = unit(found.profile) * found.fit.by_error[found.fit.slices[name]]
         for k, (error, std) in enumerate(zip(errors, stds, strict=True)):
             rows.append({"value": value.name, "component": k, "error": float(error), "std": float(std),
-                         "shared_std": float(shared[k]), "error_in_std": float(error / std)})  # fmt: skip
+                         "shared_std": float(shared[k]), "blur_std": float(blurred[k]),
+                         "error_in_std": float(error / std)})  # fmt: skip
     return rows
 
 
@@ -185,6 +199,19 @@ def _implied_factor(rows: Sequence[Row]) -> float:
     factors = np.linspace(0.0, 4.0, 401)
     medians = [float(np.median(np.abs(error) / np.sqrt(rest + (factor * shared) ** 2))) for factor in factors]
     return float(factors[int(np.argmin(np.abs(np.array(medians) - NORMAL_MEDIAN)))])
+
+
+def most_likely(rows: Sequence[Row]) -> tuple[float, float]:
+    """Shared fraction and part of the blur's bias left, for which these errors are most likely if they are normal."""
+    error, std, shared, blurred = (
+        np.array([row[k] for row in rows]) for k in ("error", "std", "shared_std", "blur_std")
+    )
+    rest = np.maximum(std**2 - shared**2 - blurred**2, LEAST_REST * std**2)
+    costs = {}
+    for share, left in product(SHARES, LEFTS):
+        variance = rest + (share / EVEN_SHARED * shared) ** 2 + (left / LEFT_BY_EVEN_BLUR * blurred) ** 2
+        costs[float(share), float(left)] = float((np.log(variance) + error**2 / variance).sum())
+    return min(costs, key=costs.__getitem__)
 
 
 def _shown(name: str, one: dict[str, Any]) -> list[str]:
