@@ -47,6 +47,8 @@ SHARPENED = 0.25
 
 Values from 0.12 to 0.5 change the mean gain by at most 0.02 dB on 13 simulated captures, sharpened and not, whose edges
 leave the question open.  A lower value costs less for unsharpened pictures."""
+HIDDEN = 0.5
+"""Fraction of sharpened movies whose edges show no overshoot: natural edges approach their plateau slowly."""
 BARE_ALL, BARE_SHARPEST = (0.001, 0.003), (0.0056, 0.0056)
 """Overshoot of unsharpened movies relative to the step, mean and standard deviation, for all edges and the sharpest.
 
@@ -117,24 +119,35 @@ class Overshoot:
         _, amount, log_radius, *_ = _fitted(self.sharpest)
         return UnsharpMask(float(amount), float(np.exp(log_radius)))
 
+    @property
+    def certain(self) -> bool:
+        """Whether the overshoot alone shows that the movie was sharpened."""
+        return self.p_value <= FALSE_ALARM
+
     def expected_mask(self) -> UnsharpMask:
-        """The fitted mask, with the amount's expectation over its being present or not."""
+        """The expectation over no mask, a usual one that the edges hide, and the fitted one, which they show."""
         theta = _fitted(self.sharpest)
-        amount = max(float(theta[1]), 0.0) * (1.0 if self.p_value <= FALSE_ALARM else self._chance(theta))
-        return UnsharpMask(amount, float(np.exp(theta[2])))
+        fitted, radius_px = max(float(theta[1]), 0.0), float(np.exp(theta[2]))
+        if self.certain:
+            return UnsharpMask(fitted, radius_px)
+        shown, hidden = self._chances(theta)
+        parts = np.array([shown * fitted, hidden * AMOUNT])
+        return UnsharpMask(float(parts.sum()), float(parts @ (radius_px, RADIUS_PX) / max(parts.sum(), 1e-9)))
 
-    def _chance(self, theta: Array) -> float:
-        """Probability that the movie was sharpened, from the sharpest edges' overshoot, normal with and without a mask.
+    def _chances(self, theta: Array) -> tuple[float, float]:
+        """Probabilities of a mask that the edges show, and of one that they hide, from the sharpest edges' overshoot.
 
-        With a mask, the mean is the overshoot that a usual mask causes at edges of the fitted width, and its standard
-        deviation includes that of the amount.  0 if the overshoot is more likely without a mask.
+        The overshoot is normal.  With a mask that shows, the mean is the overshoot that a usual mask causes at edges of
+        the fitted width, and the standard deviation includes that of the amount.  A hidden mask changes nothing.
         """
         usual = np.array([theta[0], AMOUNT, *theta[2:]])
         more = float(_beside_line(usual).max() - _beside_line(usual * (1, 0, 1, 1, 1, 1)).max())
         found, std = self.of_sharpest - BARE_SHARPEST[0], self.sharpest_std
         std_with = float(np.hypot(std, more * AMOUNT_SPREAD / AMOUNT))
-        odds = std / std_with * np.exp(0.5 * ((found / std) ** 2 - ((found - more) / std_with) ** 2))
-        return float(SHARPENED * odds / (SHARPENED * odds + 1 - SHARPENED)) if odds > 1 else 0.0
+        log_ratio = 0.5 * ((found / std) ** 2 - ((found - more) / std_with) ** 2)
+        odds = SHARPENED / (1 - SHARPENED) * np.array([(1 - HIDDEN) * std / std_with * np.exp(log_ratio), HIDDEN])
+        shown, hidden = odds / (1 + odds.sum())
+        return float(shown), float(hidden)
 
 
 def seen_mask(pictures: Iterable[tuple[Picture, RowMotion]]) -> UnsharpMask | None:
