@@ -273,3 +273,12 @@ def test_a_blur_longer_than_a_measured_tile_is_undone(simulated):
     assert max(lengths) > 100
     assert gains.min() > -0.1
     assert gains[int(np.argmax(lengths))] > 0.2
+
+
+def test_frames_smaller_than_a_compared_tile_have_no_neighbours(simulated):
+    """They are restored alone; the comparison used to fail."""
+    capture = simulated(width=72, height=56, focal_px=70.0, exposure_ms=30.0, frames=4)
+    plan = capture.plan(PRESETS["balanced"])
+    assert plan.missing_turn is None
+    assert plan.confirmed is None
+    assert [restored.status for restored in capture.restored(plan)] == ["restored"] * 4
