@@ -139,3 +139,13 @@ def test_a_simulated_frame_is_out_of_focus_when_its_field_says_so() -> None:
     cornered = defocused(CAMERA, Hidden(corner_blur_px=3.0), light, 0.0)[..., 0]
     assert cornered[60, 80] > 0.9
     assert cornered[20, 20] < 0.2
+
+
+def test_a_logged_focal_length_is_that_of_the_frame_on_a_clock_that_runs_fast() -> None:
+    """The log is on the camera's clock; offset, skew and a wandering clock lead from there to the lens's, IMU's time."""
+    logged = Field("scale", ("focus",), ((0.0, 1.0),), ((0.0,), (0.1,)), log=((0.0, 0.4, 0.8), (0.0, 1.0, 0.2)))
+    late = Field("delay", ("time",), ((0.0, 1.0),), ((0.03,), (0.0,)))
+    profile = replace(CAMERA.with_fields([logged, late]), clock_skew=0.15, time_offset_s=0.02)
+    lens = moving_lens(integrate_gyro(log(), profile), profile)
+    seen = lens.project(np.array([0.1, 0.2, 1.0]), profile.imu_time_s(0.4))
+    assert seen == pytest.approx([80.0 + 13.0 * 1.1, 58.0 + 26.0 * 1.1], abs=1e-9)
