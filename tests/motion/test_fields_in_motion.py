@@ -142,7 +142,7 @@ def test_a_simulated_frame_is_out_of_focus_when_its_field_says_so() -> None:
 
 
 def test_a_logged_focal_length_is_that_of_the_frame_on_a_clock_that_runs_fast() -> None:
-    """The log is on the camera's clock; offset, skew and a wandering clock lead from there to the lens's, IMU's time."""
+    """The log is on the camera's clock: offset, skew and a wandering clock lead from there to the IMU's time."""
     logged = Field("scale", ("focus",), ((0.0, 1.0),), ((0.0,), (0.1,)), log=((0.0, 0.4, 0.8), (0.0, 1.0, 0.2)))
     late = Field("delay", ("time",), ((0.0, 1.0),), ((0.03,), (0.0,)))
     profile = replace(CAMERA.with_fields([logged, late]), clock_skew=0.15, time_offset_s=0.02)
