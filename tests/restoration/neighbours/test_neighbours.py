@@ -282,3 +282,17 @@ def test_frames_smaller_than_a_compared_tile_have_no_neighbours(simulated):
     assert plan.missing_turn is None
     assert plan.confirmed is None
     assert [restored.status for restored in capture.restored(plan)] == ["restored"] * 4
+
+
+@pytest.mark.parametrize("effect", ["vignetting=0.6", "flicker=0.4,100"])
+def test_uneven_light_keeps_no_neighbour_away(simulated, effect):
+    """Frame and neighbours are joined without their vignetting and flicker, which lie elsewhere in each."""
+    capture = simulated(config=True, effects=[effect], width=208, height=272, frames=5, bitrate_bits_per_px=2.0)
+    plan = RestorationPlan(capture.profile, PRESETS["balanced"])
+    gains = []
+    for one in (plan, replace(plan, settings=replace(plan.settings, neighbours=0))):
+        pictures = [(frame, picture) for frame, picture in capture.recorded()]
+        (found,) = restore_frames(pictures, capture.capture.imu, one, {2})
+        gains.append(psnr_db(found.picture, capture.truth(2), found.valid_px))
+        assert bool(found.degradation.deblur.neighbours) == (one is plan)
+    assert gains[0] > gains[1] + 0.5
