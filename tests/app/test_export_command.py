@@ -264,3 +264,18 @@ def test_fields_are_applied_or_noted(walk, tmp_path):
     first_s = (after.stamp_0_ns - start_ns) / 1e9
     (scale,) = own.extensions.field
     np.testing.assert_allclose(scale.at_time(0.3)[0], 0.02 * profile.imu_time_s(first_s + 0.3), atol=1e-5)
+
+
+def test_a_clock_that_wanders_moves_samples_and_no_frame(walk, tmp_path):
+    """Frames show the same instants on the camera's clock, whatever the delays of frames and of rows."""
+    profile, start_ns = read_profile(walk / "camera.yaml"), read_capture(walk).stamp_0_ns
+    late = Field("delay", ("time",), ((0.0, 0.2, 0.4),), ((0.006,), (-0.002,), (0.004,)), (), start_ns)
+    uneven = ((0.002,), (0.003,), (0.0,), (0.001,))
+    rows = Field("delay", ("row", "time"), ((0.0, 1.0), (0.0, 1.0)), uneven, (), start_ns)
+    config = tmp_path / "wandering.yaml"
+    config.write_text(format_profile(profile.with_fields([late, rows])))
+    even, wandering = (
+        plan_export(str(walk), ExportOptions(tmp_path / "out", config=file)) for file in (walk / "camera.yaml", config)
+    )
+    assert wandering.instant_s == pytest.approx(even.instant_s, abs=1e-9)
+    assert np.ptp(wandering.imu_time_ns - even.imu_time_ns) > 5e6

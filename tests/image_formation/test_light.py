@@ -11,8 +11,17 @@ from laws import TurningCamera, phone
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.image_formation.kernels import kernel_field
-from virest.image_formation.light import equivalent_length_px, frame_light, most_defocus_px, row_light, vignetting
+from virest.image_formation.light import (
+    defocus_px,
+    equivalent_length_px,
+    frame_light,
+    most_defocus_px,
+    row_light,
+    vignetting,
+)
+from virest.image_formation.neighbour import neighbour_view
 from virest.image_formation.warp import straightened_points
+from virest.motion.optics import moving_lens
 from virest.simulation.sensor import sensor_light
 
 PIXELS = np.array([[0.0, 0.0], [199, 135], [37, 101], [150, 12]])
@@ -136,3 +145,23 @@ def test_flicker_weights_the_instants_of_a_path() -> None:
     found = kernel.sum(axis=0) @ np.arange(-field.radius_px, field.radius_px + 1)
     assert found == pytest.approx(expected, abs=1e-3)
     assert abs(expected - field.paths_px[0, :, 0].mean()) > 0.05
+
+
+def test_a_neighbour_brings_the_flicker_and_softness_of_its_own_rows() -> None:
+    """Its kernels at a pixel of the frame are those of the place, and so of the row, where it recorded the point."""
+    soft = Field("blur", ("radius",), ((0.0, 150.0),), ((0.2,), (2.0,)))
+    profile = extended(flicker_amplitude=0.5, flicker_frequency_hz=90.0).with_fields([soft])
+    first = TurningCamera(profile, rate_rad_s=(4.0, -1.0, 0.5))
+    second = replace(first, stamp_s=first.stamp_s + 1 / 30)
+    lens = moving_lens(first.trajectory, profile)
+    view = neighbour_view(first.motion, second.motion, first.trajectory, lens)
+    at_px = np.array([[90.0, 70.0], [120.0, 60.0]])
+    there_px = view.places_px(at_px)
+    assert np.abs(there_px - at_px).min(axis=0)[1] > 20
+    found = view.field()(at_px)
+    assert found.light is not None
+    count = found.light.shape[1]
+    middles_s = second.motion.row_time_s(there_px[:, None], (np.arange(count) + 0.5) / count)
+    assert found.light == pytest.approx(1 + 0.5 * np.sin(2 * np.pi * 90 * middles_s), abs=1e-3)
+    assert found.defocus_sigma_px == pytest.approx(defocus_px(profile, there_px), abs=1e-6)
+    assert found.centres_px == pytest.approx(at_px)

@@ -100,16 +100,31 @@ def test_a_row_delay_is_the_same_in_the_simulator() -> None:
 def test_a_delay_over_row_and_time_is_the_same_everywhere() -> None:
     """The clock of points, the motion of a frame and the simulator have the same delay."""
     rows = Field("delay", ("row",), ((0.0, 1.0),), ((0.0,), (0.002,)))
-    later = tuple((0.003 * r * r * t,) for r in (0.0, 0.5, 1.0) for t in (0.0, 1.0))
+    later = tuple((0.003 * (0.4 + r * r) * t,) for r in (0.0, 0.5, 1.0) for t in (0.0, 1.0))
     profile = CAMERA.with_fields([rows, Field("delay", ("row", "time"), ((0.0, 0.5, 1.0), (0.0, 1.0)), later)])
     points = np.stack([np.zeros(120), np.arange(120.0)], axis=-1)
     fraction, stamp_s = np.arange(120) / 120, 0.6
     even_s = RowClock(CAMERA).seen_s(points, stamp_s, 0.008)
     late_s = RowClock(profile).seen_s(points, stamp_s, 0.008) - even_s
-    assert late_s == pytest.approx(0.002 * fraction + 0.0018 * np.minimum(1.1 * fraction, 1) ** 2, abs=1e-9)
+    by_row = 0.4 + np.minimum(1.1 * fraction, 1) ** 2  # the first row is late too
+    assert late_s == pytest.approx(0.002 * fraction + 0.0018 * by_row, abs=1e-9)
     motion = row_motion(integrate_gyro(log(), profile), profile, stamp_s, 0.008)
     assert motion.row_time_s(points, 0.5) - even_s == pytest.approx(late_s, abs=2e-5)
     assert late_rows_s(profile, NOTHING, fraction, stamp_s) == pytest.approx(late_s, abs=1e-9)
+
+
+@pytest.mark.parametrize("covariates", [("row",), ("row", "time")])
+def test_the_motion_over_a_frame_reaches_to_its_latest_row(covariates: tuple[str, ...]) -> None:
+    """Also where a row is later than an even readout by more than a quarter of it."""
+    knots = ((0.0, 1.0),) * len(covariates)
+    values = ((0.0,), (0.014,)) if len(knots) == 1 else ((0.0,), (0.0,), (0.014,), (0.014,))
+    profile = CAMERA.with_fields([Field("delay", covariates, knots, values)])
+    trajectory = integrate_gyro(log(), profile)
+    motion = row_motion(trajectory, profile, 0.3, 0.004)
+    ends_s = motion.row_time_s(np.array([[0.0, 119.0]]), 1.0)
+    expected = np.swapaxes(trajectory.orientation(ends_s), -1, -2) @ trajectory.orientation(motion.reference_s)
+    assert motion.reference_s == pytest.approx(0.3)
+    assert motion.pose(ends_s)[0] == pytest.approx(expected, abs=1e-6)
 
 
 def test_rows_that_start_late_at_long_exposures_do_so_in_a_frame_and_in_the_simulator() -> None:
@@ -142,3 +157,13 @@ def test_a_simulated_frame_has_the_blur_of_its_field() -> None:
     cornered = defocused(CAMERA, Hidden(corner_blur_px=3.0), light, 0.0)[..., 0]
     assert cornered[60, 80] > 0.9
     assert cornered[20, 20] < 0.2
+
+
+def test_a_logged_focal_length_is_that_of_the_frame_on_a_clock_that_runs_fast() -> None:
+    """The log is on the camera's clock: offset, skew and a wandering clock lead from there to the IMU's time."""
+    logged = Field("scale", ("focus",), ((0.0, 1.0),), ((0.0,), (0.1,)), log=((0.0, 0.4, 0.8), (0.0, 1.0, 0.2)))
+    late = Field("delay", ("time",), ((0.0, 1.0),), ((0.03,), (0.0,)))
+    profile = replace(CAMERA.with_fields([logged, late]), clock_skew=0.15, time_offset_s=0.02)
+    lens = moving_lens(integrate_gyro(log(), profile), profile)
+    seen = lens.project(np.array([0.1, 0.2, 1.0]), profile.imu_time_s(0.4))
+    assert seen == pytest.approx([80.0 + 13.0 * 1.1, 58.0 + 26.0 * 1.1], abs=1e-9)

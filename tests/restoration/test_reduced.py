@@ -81,6 +81,20 @@ def test_tiles_are_as_large_as_their_kernels_allow() -> None:
     assert sides(0.0, 1.0).min() > 1e4
 
 
+def test_tiles_are_smaller_where_flicker_moves_the_light_along_the_paths() -> None:
+    """The faster the light changes from row to row, the smaller; light that is the same in all rows changes nothing."""
+
+    def side_px(per_row_rad: float) -> float:
+        def field(centres_px: NDArray[np.float64]) -> KernelField:
+            phase = np.linspace(0, 7, 31) + per_row_rad * centres_px[:, 1, None]
+            return replace(_field(centres_px), light=1 + 0.4 * np.sin(phase))
+
+        blurred = replace(_blurred(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)), field=field)
+        return tile_layout.luma_tiles(blurred, PRESETS["balanced"]).grid.side
+
+    assert side_px(0.03) < side_px(0.015) < side_px(0.0) == side_px(1e-6)
+
+
 def test_a_path_longer_than_a_tile_enlarges_the_transform() -> None:
     """Thin margins grow if a kernel would not fit."""
     blurred = _blurred(np.full((HEIGHT, WIDTH, 3), 90, np.uint8))

@@ -257,7 +257,9 @@ def _instants_s(frames: list[Frame], profile: CameraProfile, reference: str) -> 
     exposures_s = np.array([np.nan if frame.exposure_s is None else frame.exposure_s for frame in frames])
     usual_s = float(np.nanmedian(exposures_s)) if np.isfinite(exposures_s).any() else 0.0
     exposures_s = np.where(np.isfinite(exposures_s), exposures_s, usual_s)
-    clock = RowClock(replace(profile, time_offset_s=0.0, clock_skew=0.0))  # samples are written on the camera's clock
+    # samples are written on the camera's clock, and rows are late relative to an even readout
+    even = profile.with_fields([field for field in profile.fields if field.kind != "delay"])
+    clock = RowClock(replace(even, time_offset_s=0.0, clock_skew=0.0))
     instant = clock.time_s if reference == "exposure-start" else clock.middle_s
     return np.asarray(instant(np.zeros(len(frames)), exposures_s), np.float64)
 

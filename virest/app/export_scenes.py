@@ -114,14 +114,12 @@ def _pose(
     poses: GivenPoses | None,
 ) -> FramePose:
     camera = plan.camera
-    rate = 1.0 + camera.clock_skew
     first_s, last_s = motion.start_s, motion.end_s
     instant_s = motion.start_s if plan.restored_start else motion.middle_s
-    zero_s = source.time_s * rate + (camera.time_offset_s or 0.0)
 
     def at(time_s: float) -> tuple[Array, Array | None]:
         if poses is not None:
-            given = poses.at(source.timestamp_ns + round((time_s - zero_s) / rate * 1e9))
+            given = poses.at(source.timestamp_ns + round((camera.camera_time_s(time_s) - source.time_s) * 1e9))
             if given is not None:
                 return given
         return np.asarray(trajectory.orientation(time_s)), None

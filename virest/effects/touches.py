@@ -53,10 +53,15 @@ def touched(before: CameraProfile, after: CameraProfile) -> Touched:
         found |= {OF_EXTENSIONS.get(name, RATES) for name in changed if name != "field"}
         if "field" in changed:
             found |= {OF_FIELDS.get(kind, RATES) for kind in _changed_kinds(before, after)}
-    # fields over logged covariates are on the camera clock: on the IMU clock they move with the time offset
+    # fields over logged covariates are on the camera clock: on the IMU clock they move with the clocks
     logged = any(field.log is not None for field in after.extensions.field)
-    later = logged and before.time_offset_s != after.time_offset_s
+    later = logged and _clocks(before) != _clocks(after)
     return Touched(RATES in found, AXES in found, LENS in found or later)
+
+
+def _clocks(profile: CameraProfile) -> tuple[Any, ...]:
+    """What relates the camera's clock to that of the IMU."""
+    return profile.time_offset_s, profile.clock_skew, _of_kind(profile, "delay")
 
 
 def _changed(before: Any, after: Any) -> set[str]:

@@ -62,8 +62,16 @@ def frame_light(motion: RowMotion, anchor: float, straighten: bool) -> FrameLigh
     if straighten and shaded:
         placed = grid_filled(motion, lambda points: straightened_points(motion, points, anchor))
         there = vignetting(motion.profile, placed[..., 0], placed[..., 1])
-    rows = np.maximum(row_light(motion, _along_readout(motion.profile)), LEAST_LIGHT).astype(np.float32)
-    return FrameLight(here * rows, here, there)
+    rows = flicker_of_rows(motion)
+    return FrameLight(here if rows is None else here * rows, here, there)
+
+
+def flicker_of_rows(motion: RowMotion) -> Image | None:
+    """Mean flicker of each row of one frame, (height, 1), or (1, width) if columns are read; None without flicker."""
+    if not motion.profile.extensions.flicker_amplitude:
+        return None
+    rows = row_light(motion, _along_readout(motion.profile))
+    return np.asarray(np.maximum(rows, LEAST_LIGHT), np.float32)
 
 
 def _along_readout(profile: CameraProfile) -> Array:

@@ -9,7 +9,7 @@ same f by other kernels.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +71,13 @@ class NeighbourView:
             return seen - centres_px[:, None]
 
         at = splined_nodes(self.frame, nodes)
-        return lambda centres_px: field_along(self.neighbour, centres_px, at(centres_px), self.anchor)
+
+        def along(centres_px: Array) -> KernelField:
+            # flicker and defocus are those where the neighbour recorded them
+            field = field_along(self.neighbour, self.places_px(centres_px), at(centres_px), self.anchor)
+            return replace(field, centres_px=centres_px)
+
+        return along
 
 
 def neighbour_view(

@@ -9,7 +9,7 @@ import numpy as np
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, RowClock, of_frame, row_time_s
+from virest.image_formation.row_clock import ROW_END, ROW_MIDDLE, ROWS, RowClock, of_frame, row_time_s
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.relief_surface import Relief
 from virest.motion.trajectory import Trajectory, rotation_from_vector, vector_from_rotation
@@ -235,8 +235,8 @@ def row_motion(
     start_s, reference_s = frame_times_s(profile, stamp_s, logged_exposure_s, reference)
     if lens is None and profile.intrinsics is not None:
         lens = moving_lens(trajectory, profile)
-    span_s = start_s, float(RowClock(profile).end_s(stamp_s, logged_exposure_s or 0.0))
     own = of_frame(profile, stamp_s, logged_exposure_s or 0.0)
+    span_s = start_s, float(RowClock(own).end_s(stamp_s, logged_exposure_s or 0.0))
     return _tabulated(trajectory, span_s, start_s, exposure_s, reference_s, own, lens, translation)
 
 
@@ -280,10 +280,11 @@ def _tabulated(
     lens: MovingLens | None,
     translation: FrameTranslation | None,
 ) -> RowMotion:
-    """A motion's table over a span, extended for points just outside the picture."""
-    readout_s = profile.shutter.readout_time_s
-    first_s = span_s[0] - OUTSIDE_FRACTION * readout_s - STEP_S
-    last_s = span_s[1] + OUTSIDE_FRACTION * readout_s + STEP_S
+    """A motion's table over a span of even rows, extended for uneven ones and for points just outside the picture."""
+    readout_s, uneven = profile.shutter.readout_time_s, profile.shutter.uneven
+    late_s = np.zeros(1) if uneven is None else uneven.at(ROWS)
+    first_s = span_s[0] + late_s.min(initial=0.0) - OUTSIDE_FRACTION * readout_s - STEP_S
+    last_s = span_s[1] + late_s.max(initial=0.0) + OUTSIDE_FRACTION * readout_s + STEP_S
     steps = np.arange(int(np.ceil((last_s - first_s) / STEP_S)) + 2, dtype=np.float64)
     time_s = first_s + STEP_S * steps
     r_world_ref = trajectory.orientation(reference_s)
@@ -303,7 +304,11 @@ def _tabulated(
 def frame_times_s(
     profile: CameraProfile, stamp_s: float, logged_exposure_s: float | None, reference: str
 ) -> tuple[float, float]:
-    """(start of the first row's exposure, reference time) of a frame, IMU clock; arguments as :func:`row_motion`."""
-    clock, logged = RowClock(profile), logged_exposure_s or 0.0
+    """(start of the first row's exposure, reference time) of a frame, IMU clock; arguments as :func:`row_motion`.
+
+    Both are those of an even readout: delays of rows are counted from it.
+    """
+    logged = logged_exposure_s or 0.0
+    clock = RowClock(of_frame(profile, stamp_s, logged))
     start_s = float(clock.time_s(stamp_s, logged))
     return start_s, start_s if reference != "frame-middle" else float(clock.middle_s(stamp_s, logged))

@@ -154,7 +154,10 @@ def moving_lens(
 
 def _on_imu_clock(field: Field, profile: CameraProfile) -> Field:
     """A field over a logged covariate with its times converted to the IMU clock; other fields are unchanged."""
-    return field if field.log is None else field.later(-(profile.time_offset_s or 0.0))
+    if field.log is None:
+        return field
+    time_s, values = field.log
+    return replace(field, log=(tuple(np.asarray(profile.imu_time_s(np.array(time_s)), float).tolist()), values))
 
 
 def _shift_grid(start_s: float, end_s: float, step_s: float) -> Array:

@@ -96,9 +96,12 @@ def _unexplained(found: Settled) -> str:
 
 
 def _rate_off_rad_s(found: Settled, observed: ObservedTracks) -> float | None:
-    """The rotation rate, per axis, that would move points as far as they still lie off beyond the tracking noise."""
+    """The rotation rate, per axis, that would move points as far as they still lie off beyond the tracking noise.
+
+    None where they do not, or where there are too few.
+    """
     lens = found.profile.intrinsics
-    if found.after_px < CONTRADICTED * found.noise_px or lens is None or not observed.pairs:
+    if found.after_px <= CONTRADICTED * found.noise_px or lens is None or not observed.pairs:
         return None
     period_s = float(np.median([observed.stamp_s[p.second] - observed.stamp_s[p.first] for p in observed.pairs]))
     return float(np.sqrt(found.after_px**2 - found.noise_px**2) / (lens.fx_px * period_s))

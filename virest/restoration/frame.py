@@ -303,7 +303,7 @@ def _deblurred(
     if why_not:
         return as_shown, None, (why_not,)
     blurred = blurred_picture(picture, curve, (measured.luma, measured.chroma), measured.field, blur.longest_px)
-    together = neighbours is not None and light is None and blur.anchor == 0.5
+    together = neighbours is not None and blur.anchor == 0.5
     found = neighbours(measured.luma, measured.field) if together and neighbours is not None else ()
     joined = joined_neighbours(found, measured.luma_model)
     longest_px = max((blur.longest_px, *(one.longest_px for one in joined.registrations)))

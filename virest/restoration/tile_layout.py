@@ -49,29 +49,42 @@ def luma_tiles(
     blurred: BlurredPicture, settings: RestorationSettings, around: Surroundings = FULL_MARGIN
 ) -> tiles.TileDeconvolution:
     """Tiles over the picture's luma, smaller than the preset's where the kernels vary fast."""
-    path_side_px, defocus_side_px = _largest_sides_px(blurred)
+    path_side_px, light_side_px = _largest_sides_px(blurred)
     side_px = float(settings.tile_px)
     if around is not FULL_MARGIN:
         side_px = float(np.clip(path_side_px, LEAST_TILE * side_px, side_px))
-    side_px = min(side_px, max(defocus_side_px, LEAST_TILE_PX))
+    side_px = min(side_px, max(light_side_px, LEAST_TILE_PX))
     overlap_parts = FINE_OVERLAP if around is FULL_MARGIN else WIDE_OVERLAP
     return tile_deconvolution(blurred, int(side_px), overlap_parts, around=around)
 
 
 def _largest_sides_px(blurred: BlurredPicture) -> tuple[float, float]:
-    """Largest tile sides, px, for which the centre's kernel is accurate enough: for the paths, and for the defocus.
+    """Largest tile sides, px, for which the centre's kernel is accurate enough: for the paths, and for the light there.
 
     Half a tile step from the centre, a third of the side, the wrong kernel changes edges by MOST_WRONG noise standard
-    deviations.  Paths vary over the picture with camera roll and row time; defocus increases towards the corners.  With
-    more noise both matter less.
+    deviations.  Paths vary over the picture with camera roll and row time; defocus increases towards the corners, and
+    flicker moves the light along the paths from row to row.  With more noise all matter less.
     """
     y, x, paths_px, sigma_px = sampled_kernels(blurred)
     changes = [np.diff(paths_px[:, :, ::4], axis=axis) / (at[1] - at[0]) for axis, at in enumerate((y, x))]
     per_px = np.sqrt(0.5 * sum(np.mean(np.linalg.norm(c, axis=-1).mean(-1)) ** 2 for c in changes))
     softer = np.mean(np.hypot(*np.gradient(sigma_px, y, x)))
     wrong_px = MOST_WRONG * blurred.statistics.noise_levels / blurred.statistics.gradient_scale
-    path_side_px, defocus_side_px = (float(3 * wrong_px / max(change, 1e-6)) for change in (per_px, softer))
-    return path_side_px, defocus_side_px
+    sides_px = (float(3 * wrong_px / max(change, 1e-6)) for change in (per_px, softer, _pulse_change(blurred, y, x)))
+    path_side_px, *light_sides_px = sides_px
+    return path_side_px, min(light_sides_px)
+
+
+def _pulse_change(blurred: BlurredPicture, y: Array, x: Array) -> float:
+    """How far flicker moves the light along the paths, px per px across the rows: mean over points y × x."""
+    points_px = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    field = blurred.field(np.concatenate([points_px, points_px + 1.0]))  # one px further: rows may be columns
+    if field.light is None:
+        return 0.0
+    here, beside = np.split(field.light / field.light.sum(axis=1, keepdims=True), 2)
+    ahead = np.abs(np.cumsum(beside - here, axis=1))[:, :-1]
+    steps_px = np.linalg.norm(np.diff(field.paths_px[: len(here)], axis=1), axis=-1)
+    return float((ahead * steps_px).sum(axis=1).mean())
 
 
 def sampled_kernels(blurred: BlurredPicture) -> tuple[Array, Array, Array, Array]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from virest.image_formation.blur import Image, tile_grid
 from virest.image_formation.kernel_spread import kernel_spread
 from virest.image_formation.kernels import blur_chords, smooth_field
-from virest.image_formation.light import equivalent_length_px, most_defocus_px
+from virest.image_formation.light import equivalent_length_px, flicker_of_rows, most_defocus_px
 from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import blurred_picture
 from virest.restoration.frame import deblur_method
@@ -37,7 +37,8 @@ def try_restoration(
 ) -> tuple[Image, Image] | None:
     """Restore a luma (height, width); None if it would not be deblurred.
 
-    Returns its linear light as recorded and as restored, at the reduced size at which neighbours are compared.
+    Returns its linear light as recorded and as restored, without flicker, at the reduced size at which neighbours are
+    compared.
     """
     height, width = luma.shape
     centres_px = tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px
@@ -56,4 +57,7 @@ def try_restoration(
     sharp, recorded = tile_hyper_laplacian(replace(blurred, spread=spread), settings, THIN_MARGIN), blurred.light[0]
     part = trusted_share(model) * blurred_part(motion, settings.min_blur_px, settings.tile_px)
     restored = recorded + part * (np.clip(sharp, *curve.light_range) - recorded)
+    rows = flicker_of_rows(motion)
+    if rows is not None:
+        recorded, restored = recorded / rows, restored / rows
     return reduced(recorded), reduced(restored)

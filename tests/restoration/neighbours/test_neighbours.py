@@ -273,3 +273,26 @@ def test_a_blur_longer_than_a_tile_is_undone(simulated):
     assert max(lengths) > 100
     assert gains.min() > -0.1
     assert gains[int(np.argmax(lengths))] > 0.2
+
+
+def test_frames_smaller_than_a_compared_tile_have_no_neighbours(simulated):
+    """They are restored alone; the comparison used to fail."""
+    capture = simulated(width=72, height=56, focal_px=70.0, exposure_ms=30.0, frames=4)
+    plan = capture.plan(PRESETS["balanced"])
+    assert plan.missing_turn is None
+    assert plan.confirmed is None
+    assert [restored.status for restored in capture.restored(plan)] == ["restored"] * 4
+
+
+@pytest.mark.parametrize("effect", ["vignetting=0.6", "flicker=0.4,100"])
+def test_uneven_light_keeps_no_neighbour_away(simulated, effect):
+    """Frame and neighbours are joined without their vignetting and flicker, which lie elsewhere in each."""
+    capture = simulated(config=True, effects=[effect], width=208, height=272, frames=5, bitrate_bits_per_px=2.0)
+    plan = RestorationPlan(capture.profile, PRESETS["balanced"])
+    gains = []
+    for one in (plan, replace(plan, settings=replace(plan.settings, neighbours=0))):
+        pictures = [(frame, picture) for frame, picture in capture.recorded()]
+        (found,) = restore_frames(pictures, capture.capture.imu, one, {2})
+        gains.append(psnr_db(found.picture, capture.truth(2), found.valid_px))
+        assert bool(found.degradation.deblur.neighbours) == (one is plan)
+    assert gains[0] > gains[1] + 0.5

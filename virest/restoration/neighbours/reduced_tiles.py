@@ -74,14 +74,14 @@ def power_of(spectra: NDArray[np.complex64]) -> NDArray[np.float32]:
 
 
 def spread_tiles(height: int, width: int, most: int = MOST_TILES) -> Index:
-    """(n, 2) top and left of at most ``most`` tiles, evenly spaced over a picture.
+    """(n, 2) top and left of at most ``most`` tiles, evenly spaced over a picture; none if it is smaller than a tile.
 
     With ``most`` above MOST_TILES, tiles overlap where needed to cover the picture completely.
     """
+    if min(height, width) < TILE:
+        return np.zeros((0, 2), np.intp)
     tops, lefts = (
-        np.linspace(0, length - TILE, max(1, -(-length // TILE) if most > MOST_TILES else length // TILE)).astype(
-            np.intp
-        )
+        np.linspace(0, length - TILE, -(-length // TILE) if most > MOST_TILES else length // TILE).astype(np.intp)
         for length in (height, width)
     )
     corners = np.stack(np.meshgrid(tops, lefts, indexing="ij"), -1).reshape(-1, 2)
@@ -99,8 +99,10 @@ def kernel_spectra(
 ) -> NDArray[np.complex64] | None:
     """Spectra of the transposed kernels at tiles' centres, (n, WIDE, WIDE / 2 + 1); a product applies the blur.
 
-    None if a path does not fit into half a tile.
+    None if a path does not fit into half a tile, or if there are no tiles.
     """
+    if not len(tops_lefts):
+        return None
     kernels = field(full_px(tops_lefts, times, (TILE - 1) / 2)).scaled(1 / times)
     radius = kernels.radius_px
     if 2 * radius + 1 > TILE // 2:

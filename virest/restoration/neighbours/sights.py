@@ -19,7 +19,9 @@ from virest.capture.pixels import BT601_LUMA
 from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import kernel_spread
 from virest.image_formation.kernels import KernelField, kernel_field
+from virest.image_formation.light import flicker_of_rows, frame_light
 from virest.image_formation.neighbour import neighbour_view
+from virest.image_formation.row_clock import ROW_MIDDLE
 from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
@@ -33,7 +35,7 @@ from virest.restoration.neighbours.joint import (
     resample_neighbour,
     rings_passed,
 )
-from virest.restoration.neighbours.reduced_tiles import reduced_light
+from virest.restoration.neighbours.reduced_tiles import reduced, reduced_light
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
 from virest.restoration.neighbours.registration import (
     FrameTiles,
@@ -252,16 +254,23 @@ def _coding_noise_ratio(other: Sight, here: Sight) -> float:
 
 
 def light_of(sight: Sight) -> Image:
-    """A frame's luma in linear light, reduced."""
+    """A frame's luma in linear light, reduced, without flicker."""
     assert sight.motion is not None
     luma = sight.picture if sight.picture.ndim == 2 else cv2.cvtColor(sight.picture, cv2.COLOR_RGB2GRAY)
-    return reduced_light(luma, _linear(sight.motion.profile.curve))
+    light, rows = reduced_light(luma, _linear(sight.motion.profile.curve)), flicker_of_rows(sight.motion)
+    return light if rows is None else light / reduced(np.broadcast_to(rows, luma.shape))
 
 
 def _luma_and_half(sight: Sight) -> tuple[Image, Image]:
-    """Luma of a frame's linear light, (height, width), and its light at half the size, (height / 2, width / 2, 3)."""
+    """Luma of a frame's linear light, (height, width), and its light at half the size, (height / 2, width / 2, 3).
+
+    Without flicker and vignetting, as the frame is deblurred.
+    """
     assert sight.motion is not None
     light = cv2.LUT(sight.picture, _linear(sight.motion.profile.curve))
+    factors = frame_light(sight.motion, ROW_MIDDLE, straighten=False)
+    if factors is not None:
+        light /= factors.recorded[..., None]
     weights = np.array([BT601_LUMA], np.float32)
     return np.asarray(cv2.transform(light, weights), np.float32), half_size(light)
 
