@@ -12,7 +12,7 @@ from virest.capture.folder import Capture
 from virest.capture.join import outside_reason
 from virest.image_formation.blur import Image
 from virest.image_formation.row_motion import RowMotion
-from virest.inference.unsharp_mask import MOST_FRAMES, seen_mask, without_mask
+from virest.inference.unsharp_mask import MOST_FRAMES, RESIDUAL_AMOUNT, overshoot, without_mask
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times, moved_over_frame
@@ -72,16 +72,18 @@ def with_neighbour_survey(
 
 
 def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> tuple[RestorationPlan, dict[int, Sight]]:
-    """The plan with the phone's sharpening, if edges show one, and the frames with it undone."""
+    """The plan with the phone's sharpening as far as edges tell, and the frames with it undone."""
     if plan.settings.deblur == "none":
         return plan, dict(sights)
     usable = [(one.picture, one.motion) for one in sights.values() if one.usable and one.motion is not None]
-    mask = seen_mask(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
-    if mask is None:
+    edges = overshoot(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
+    mask = None if edges is None else edges.expected_mask()
+    if edges is None or mask is None or mask.amount <= RESIDUAL_AMOUNT:
         return plan, dict(sights)
+    seen = "edges overshoot as after" if edges.certain else "edges do not exclude"
     note = (
-        "edges overshoot as after a phone's sharpening: before deblurring, process undoes the expected "
-        f"unsharp mask, of {mask.amount:.2g} with a radius of {mask.radius_px:.2g} px"
+        f"{seen} a phone's sharpening: before deblurring, process undoes the expected unsharp mask, "
+        f"of {mask.amount:.2g} with a radius of {mask.radius_px:.2g} px"
     )
     plan = replace(plan, mask=mask, notes=(*plan.notes, note))
     return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}
