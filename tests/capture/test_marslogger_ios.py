@@ -86,6 +86,14 @@ def test_unknown_intrinsics_of_old_phones(tmp_path):
     assert resolve_profile(read_capture(tmp_path / "rec"))[0].intrinsics is None
 
 
+@pytest.mark.parametrize("fy", ["null", "0", "-75.2", "9000000"])
+def test_an_implausible_focal_length_is_not_used(tmp_path, fy):
+    """fy is then that of fx: pixels are square."""
+    write_objective_c(tmp_path / "rec", lens=f"75.10, {fy}, 47.30, 31.70")
+    lens = resolve_profile(read_capture(tmp_path / "rec"))[0].intrinsics
+    assert (lens.fx_px, lens.fy_px) == (75.1, 75.1)
+
+
 def test_seconds_of_32_bits_are_made_exact_by_the_movie(tmp_path):
     """Before June 2019 times fell on a grid of 8 ms; the movie's own steps take it away."""
     stamps = write_objective_c(tmp_path / "rec", seconds=True)

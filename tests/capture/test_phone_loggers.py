@@ -134,6 +134,41 @@ def test_an_opencamera_folder_without_its_movie_says_which(open_camera: Path) ->
         read_capture(open_camera)
 
 
+@pytest.mark.parametrize("open_camera", ["beside"], indirect=True)
+def test_what_an_opencamera_table_loses_is_counted(open_camera: Path) -> None:
+    """Rows without numbers, out of order or twice are dropped with their reason; the header is no row."""
+    gyro, stamps = (next(open_camera.glob(f"*_{name}.csv")) for name in ("gyro", "timestamps"))
+    rows = gyro.read_text().splitlines()
+    rows[100], rows[200], rows[300] = rows[100].replace("0.1,", "nan,"), "cut", rows[310]
+    gyro.write_text("\n".join(["X,Y,Z,time", *rows]) + "\n")
+    times = stamps.read_text().splitlines()
+    stamps.write_text("\n".join([*times[:5], times[4], *times[5:]]) + "\n")
+    capture = read_capture(open_camera)
+    dropped = {key: number for key, number in capture.counts.items() if "dropped" in key}
+    assert dropped == {
+        f"{gyro.name} dropped: cut or unreadable row": 2,
+        f"{gyro.name} dropped: time falls or leaps": 1,
+        f"{stamps.name} dropped: time equals its predecessor's": 1,
+    }
+    assert len(capture.usable) == COUNT
+    assert capture.counts["gyro_rows"] == len(rows)
+
+
+@pytest.mark.parametrize("open_camera", ["beside"], indirect=True)
+@pytest.mark.parametrize("name", ["gyro", "accel", "timestamps"])
+def test_opencamera_tables_are_read_within_bounds(open_camera: Path, name: str) -> None:
+    """Endless lines, bytes that are no text, folders and pipes are refused before they are read."""
+    path = next(open_camera.glob(f"*_{name}.csv"))
+    for content, says in ((b"1," * 40_000, "a line has more than"), (b"\0\n", "has NUL bytes")):
+        path.write_bytes(content)
+        with pytest.raises(CaptureError, match=says):
+            read_capture(open_camera)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(CaptureError, match="is a folder"):
+        read_capture(open_camera)
+
+
 # ── Stray Scanner ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -166,6 +201,14 @@ def test_a_stray_scan_is_read(tmp_path: Path, gravity: float) -> None:
     assert (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px) == (110.5, 111.0, 63.0, 48.5)
 
 
+def test_rows_that_a_scan_loses_are_counted(tmp_path: Path) -> None:
+    """Rows of the frames' file too, which has no metadata beside it."""
+    folder = write_scan(tmp_path / "scan", 1.0)
+    rows = (folder / "odometry.csv").read_text().splitlines()
+    (folder / "odometry.csv").write_text("\n".join([*rows[:5], rows[4], *rows[5:]]) + "\n")
+    assert read_capture(folder).counts["odometry.csv dropped: time equals its predecessor's"] == 1
+
+
 def test_accelerations_without_gravity_are_not_used(tmp_path: Path) -> None:
     """Values of no known unit are left out, and a note says so."""
     capture = read_capture(write_scan(tmp_path / "scan", 0.05))
@@ -176,7 +219,9 @@ def test_accelerations_without_gravity_are_not_used(tmp_path: Path) -> None:
 def test_a_damaged_matrix_is_one_line(tmp_path: Path) -> None:
     """Text, or the intrinsics of another picture, are refused."""
     folder = write_scan(tmp_path / "scan", 1.0)
-    for text, says in (("one, two\n", "not a 3 x 3 matrix"), ("9e4,0,1\n0,9e4,1\n0,0,1\n", "do not fit a 128x96")):
+    wrong = ("9e4,0,1\n0,9e4,1", "110,0,63\n0,0,48", "110,0,63\n0,nan,48", "110,0,63\n0,1e9,48")
+    cases = [("one, two\n", "not a 3 x 3 matrix"), *((f"{text}\n0,0,1\n", "do not fit a 128x96") for text in wrong)]
+    for text, says in cases:
         (folder / "camera_matrix.csv").write_text(text)
         with pytest.raises(CaptureError, match=says):
             read_capture(folder)

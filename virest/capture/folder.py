@@ -6,7 +6,7 @@ time, and everything skipped is counted and explained.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -449,12 +449,12 @@ def _counts(files: Source, joined: _Joined, frames: tuple[Frame, ...]) -> dict[s
     }
     for code in sorted({code for frame in frames for code in frame.skip_codes}):
         counts[f"frames_skipped: {code}"] = sum(code in frame.skip_codes for frame in frames)
-    tables: Mapping[str, StampTable | MetadataTable | GyroTable | None] = {
-        files.names.stamps: files.stamps,
-        files.names.metadata: files.metadata,
-        files.names.gyro: files.gyro,
-    }
-    for name, table in tables.items():
+    tables: tuple[tuple[str, StampTable | MetadataTable | GyroTable | None], ...] = (
+        (files.names.stamps, files.stamps),
+        (files.names.metadata, files.metadata),  # of some recorders the same file
+        (files.names.gyro, files.gyro),
+    )
+    for name, table in tables:
         for reason, number in (table.dropped if table else {}).items():
             counts[f"{name} dropped: {reason}"] = number
     return counts

@@ -231,11 +231,12 @@ def _refined(rows_ns: Int64, stamps_ns: Int64, grid_ns: float) -> Int64:
 def _profile(movie: MovieIndex, lens: _Lens, device: str) -> CameraProfile:
     """A phone's axes, and the logged intrinsics if the picture is stored as the sensor reads it."""
     profile = phone_profile(movie.width, movie.height, device)
-    known = np.isfinite(lens.fx_px) & np.isfinite(lens.cx_px)
+    known = np.isfinite([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px]).all(axis=0)
     if not known.any() or movie.height > movie.width:
         return profile
     fx, fy, cx, cy = (float(np.median(c[known])) for c in (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px))
-    plausible = 0.4 <= fx / movie.width <= 1.6 and 0 < cx < movie.width and 0 < cy < movie.height
+    plausible = 0.4 <= fx / movie.width <= 1.6 and 0.5 * fx <= fy <= 2.0 * fx
+    plausible = plausible and 0 < cx < movie.width and 0 < cy < movie.height
     if not plausible:
         return profile
     optics = Intrinsics(movie.width, movie.height, fx, fy, cx, cy)
