@@ -81,8 +81,10 @@ def _with_matrix(profile: CameraProfile, path: Path, movie: MovieIndex) -> Camer
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     plausible = 0.3 <= fx / movie.width <= 3.0 and 0.5 * fx <= fy <= 2.0 * fx
     if not (plausible and 0 < cx < movie.width and 0 < cy < movie.height):
-        numbers = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g}"
-        text = f"{label(path)}: {numbers} do not fit a {movie.width}x{movie.height} picture"
-        raise CaptureError(text, hint="give a camera.yaml")
+        raise CaptureError(
+            f"{label(path)}: fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} "
+            f"do not fit a {movie.width}x{movie.height} picture",
+            hint="give a camera.yaml",
+        )
     lens = Intrinsics(movie.width, movie.height, float(fx), float(fy), float(cx), float(cy))
     return profile.with_estimate("fx_px", float(fx), None, path.name, intrinsics=lens)
