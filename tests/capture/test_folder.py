@@ -116,6 +116,15 @@ def test_stamps_of_another_movie_are_refused_with_numbers(writer):
         read_capture(writer.folder)
 
 
+def test_stamps_that_end_early_are_said_to(writer):
+    """Rows that all fit are not those of another recording."""
+    writer.write()
+    writer.stamps_ns = writer.stamps_ns[:5]
+    writer.write_stamps()
+    with pytest.raises(ClockError, match=r"matches more than 5 of them; frame_timestamps.txt lacks most of its rows"):
+        read_capture(writer.folder)
+
+
 def test_metadata_of_another_session_are_refused(writer):
     """Not one joining metadata row means different sessions."""
     writer.write()
@@ -235,21 +244,35 @@ def test_repeats_of_a_still_phone_mean_nothing(writer):
     assert capture.notes == ()
 
 
-def test_startup_lag_from_unix_columns_alone(writer):
-    """Encoder output that comes later than usual at first marks the frames until it has settled."""
-    writer.write()
-    lags_ms = [300, 260, 200, 160, 130, *[100] * 25]
+def write_unix_columns(writer: CaptureWriter, lags_ms: list[int], cut: int = 0) -> None:
+    """Stamps and metadata with times since 1970, the encoder's later by these; ``cut`` bytes are lost at the end."""
     stamps = [
         f"{s // 1000 * 1000},{10**18 + s + lag * 10**6}" for s, lag in zip(writer.stamps_ns, lags_ms, strict=True)
     ]
-    writer.text("frame_timestamps.txt", ["Frame timestamp[nanosec],Unix time[nanosec]", *stamps])
+    path = writer.text("frame_timestamps.txt", ["Frame timestamp[nanosec],Unix time[nanosec]", *stamps])
+    path.write_bytes(path.read_bytes()[: -cut or None])
     rows = [
         f"{t},80,80,{n},5000000,33333333,20000000,144,3.95,0.1,3,{10**18 + t}" for n, t in enumerate(writer.metadata_ns)
     ]
     writer.text("movie_metadata.csv", [METADATA_11 + ",Unix time[nanosec]", *rows])
+
+
+def test_startup_lag_from_unix_columns_alone(writer):
+    """Encoder output that comes later than usual at first marks the frames until it has settled."""
+    writer.write()
+    write_unix_columns(writer, [300, 260, 200, 160, 130, *[100] * 25])
     capture = read_capture(writer.folder, look_at_pictures=False)
     assert skipped(capture) == [0, 1, 2, 3]
     assert capture.startup_lag_s == pytest.approx(0.2, abs=0.001)
+
+
+@pytest.mark.parametrize("cut", [4, 12])
+def test_a_cut_unix_time_is_no_startup(tmp_path, cut):
+    """The last number of a truncated file made a lag of thirty years, and every frame was skipped."""
+    writer = CaptureWriter(tmp_path / "short", count=12)
+    writer.write()
+    write_unix_columns(writer, [100] * 12, cut)
+    assert len(read_capture(writer.folder, look_at_pictures=False).usable) == 12
 
 
 def test_default_profile_follows_the_orientation(writer):

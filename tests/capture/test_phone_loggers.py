@@ -11,7 +11,7 @@ from other_writing import write_film
 from virest.capture.detect import choose_reader
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.sensor_logger import named_start_ns
-from virest.errors import CaptureError, ImuError, VideoError
+from virest.errors import CaptureError, ClockError, ImuError, VideoError
 
 COUNT = 16
 EPOCH_MS = 1_770_510_090_123
@@ -63,6 +63,22 @@ def test_ios_accelerations_change_their_sign(sensor_logger: Path) -> None:
     assert np.isnan(read_capture(sensor_logger).imu.accel_m_s2).all()
     (sensor_logger / "Gravity.csv").write_text(csv_rows(start_ns, "zyx", (1.0, -9.0, 0.5)))
     np.testing.assert_allclose(read_capture(sensor_logger).imu.accel_m_s2[5], (-1.1, 8.8, -0.8))
+
+
+def test_quoted_tables_of_sensor_logger_are_read(sensor_logger: Path) -> None:
+    """As R and other writers leave them."""
+    for path in sensor_logger.glob("*.csv"):
+        rows = [",".join(f'"{field}"' for field in line.split(",")) for line in path.read_text().splitlines()]
+        path.write_text("\n".join(rows) + "\n")
+    np.testing.assert_allclose(read_capture(sensor_logger).imu.gyro_rad_s[5], RATES)
+
+
+def test_nanoseconds_that_were_floats_are_refused(sensor_logger: Path) -> None:
+    """The time is named; the gyroscope was blamed."""
+    path = sensor_logger / "Gyroscope.csv"
+    path.write_text(path.read_text().replace("3000000,", "3000000.0,"))
+    with pytest.raises(ClockError, match=r"time '\d+\.0' has lost its digits"):
+        read_capture(sensor_logger)
 
 
 @pytest.mark.parametrize(
