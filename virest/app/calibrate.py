@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from virest.app.console import table
-from virest.app.outputs import output_error, write_whole
+from virest.app.outputs import output_error, require_no_input, write_whole
 from virest.calibration.calibrated_values import CalibratedValue
 from virest.calibration.geometry import FRAME_LAG, GeometryCalibration, calibrate_geometry
 from virest.calibration.unfitted_parameters import OPTIONAL
@@ -158,6 +158,7 @@ def run_calibration(
     CalibrationError, OutputError; nothing is written then.
     """
     output.require()
+    require_no_input(output.profile, plan.capture.inputs)
     facts, found, noise = find_calibration(plan, progress, each)
     text = describe(facts)
     _write(output, facts, found, noise, plan.capture)

@@ -9,6 +9,7 @@ import math
 import os
 import secrets
 import unicodedata
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,16 @@ def write_whole(path: Path, data: bytes) -> None:
 def _write_bytes(path: Path, data: bytes) -> None:
     with path.open("xb") as file:
         file.write(data)
+
+
+def require_no_input(path: Path, inputs: Iterable[Path], option: str = "--out") -> None:
+    """Raise OutputError if the output would replace a file of the recording, whatever --overwrite allows."""
+    if (
+        not is_remote(path)
+        and path.is_file()
+        and any(not is_remote(f) and f.is_file() and path.samefile(f) for f in inputs)
+    ):
+        raise OutputError(f"{path}: belongs to the recording", hint=f"name another file by {option}")
 
 
 def require_file(path: Path, *, overwrite: bool, option: str = "--out") -> None:

@@ -165,7 +165,7 @@ def _process_planned(
     if planned.index is None or planned.plan is None or (found == "finished" and options.mode == "resume"):
         with opened_run(run, job.request, "resume"):
             return _repeat_finished(job, options)
-    require_finishable(options.finish, slot.name, run.path, overwrite=options.mode != "new")
+    require_finishable(options.finish, slot.name, run.path, job.inputs, overwrite=options.mode != "new")
     with opened_run(run, job.request, options.mode):
         try:
             if options.pictures.masks:
