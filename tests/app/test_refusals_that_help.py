@@ -65,6 +65,16 @@ def test_a_curve_that_exists_is_replaced_only_where_that_is_asked_for(tmp_path: 
     assert out.read_text() == "mine"
 
 
+def test_curve_and_plot_need_two_names_and_spare_the_list(tmp_path: Path) -> None:
+    """The plot took the curve's place; the list of exposures is an input."""
+    figure, exposures = tmp_path / "curve.png", tmp_path / "exposures.csv"
+    with pytest.raises(OutputError, match="named by both --out and --plot"):
+        calibrate_curve(tmp_path, out=figure, plot=figure)
+    exposures.write_text("file,exposure_s\n")
+    with pytest.raises(OutputError, match="belongs to the recording"):
+        calibrate_curve(tmp_path, exposures=exposures, out=exposures, overwrite=True)
+
+
 def test_a_movie_that_follows_no_gyroscope_has_to_be_recorded_again() -> None:
     """Of a stabilised movie no calibration makes more: the advice does not lead to a command that refuses it."""
     unknown = replace(recorded(Setup(seed=3, frames=6)).profile, time_offset_s=None)
