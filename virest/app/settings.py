@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
@@ -50,13 +51,18 @@ def settings_model() -> type[BaseModel]:
 
 def read_settings(path: Path) -> dict[str, Any]:
     """The keys that a settings file sets. Raises SettingsError with the file, the key, and the nearest known key."""
+    return checked_settings(load_yaml_mapping(path), path.name)
+
+
+def checked_settings(content: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The keys that are set, within their ranges; ``name`` is used in messages.  Raises SettingsError."""
     model = settings_model()
     try:
-        content = model.model_validate(load_yaml_mapping(path))
+        checked = model.model_validate(dict(content))
     except ValidationError as error:
-        raise explain_validation(error, model, path.name) from None
-    chosen = content.model_dump(exclude={"virest_settings"}, exclude_unset=True)
-    return {name: value for name, value in chosen.items() if value is not None}
+        raise explain_validation(error, model, name) from None
+    chosen = checked.model_dump(exclude={"virest_settings"}, exclude_unset=True)
+    return {key: value for key, value in chosen.items() if value is not None}
 
 
 def compose_settings(file: Path | None, **options: Any) -> RestorationSettings:
@@ -64,7 +70,7 @@ def compose_settings(file: Path | None, **options: Any) -> RestorationSettings:
     content = read_settings(file) if file else {}
     chosen = {name: value for name, value in options.items() if value is not None}
     if "neighbours" in chosen:
-        chosen["most_joined"] = 2 * chosen["neighbours"]
+        chosen.setdefault("most_joined", 2 * chosen["neighbours"])
     preset = chosen.get("preset") or content.get("preset") or "balanced"
     if preset not in PRESETS:
         raise SettingsError(f"preset '{preset}' is unknown", hint=f"choose from {', '.join(PRESETS)}")
