@@ -119,6 +119,9 @@ def test_help_of_a_group_cuts_no_description(capsys: pytest.CaptureFixture[str])
         (["process", "x", "--jobs", "0"], "--jobs"),
         (["process", "x", "--resume", "--overwrite"], "--resume"),
         (["inspect", "--deep", "x"], "--deep"),
+        (["preview", "x", "--out", "p.jpg"], "end in .png"),
+        (["profile", "new", "x", "--size", "64x48"], "CAPTURE and --size"),
+        (["profile", "new", "--size", "64x48", "--focal-px", "50", "--fov-deg", "60"], "--focal-px and --fov-deg"),
     ],
 )
 def test_a_wrong_call_is_one_line_and_exit_2(virest: Virest, arguments: list[str], says: str) -> None:

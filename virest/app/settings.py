@@ -12,7 +12,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from virest.camera.yaml_mapping import explain_validation, load_yaml_mapping
 from virest.errors import SettingsError
-from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS, RestorationSettings
+from virest.restoration.settings import (
+    DEBLUR_METHODS,
+    MOST_NEIGHBOURS,
+    PRESETS,
+    REFERENCES,
+    SHUTTER_METHODS,
+    RestorationSettings,
+)
 
 _CHOICES: dict[str, tuple[str, ...]] = {
     "preset": tuple(PRESETS),
@@ -22,7 +29,10 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 }
 _RANGES: dict[str, dict[str, float]] = {
     "iterations": {"ge": 1, "le": 1000},
+    "joined_iterations": {"ge": 1, "le": 1000},
     "inner_iterations": {"ge": 1, "le": 1000},
+    "neighbours": {"ge": 0, "le": MOST_NEIGHBOURS},
+    "most_joined": {"ge": 0, "le": 2 * MOST_NEIGHBOURS},
     "tile_px": {"ge": 32, "le": 1024},
     "strength": {"gt": 0, "le": 1000},
     "min_blur_px": {"ge": 0, "le": 1000},
