@@ -78,6 +78,13 @@ def test_a_path_says_which_camera(tmp_path, part):
     assert profile.shutter.readout_time_s == pytest.approx(64 * 29473.7e-9 if part.endswith("cam1") else 0.0)
 
 
+def test_lines_of_a_camera_read_sideways_are_columns(sequence):
+    """The delay of a line counts once for each column then."""
+    with (sequence / "mav0/cam0/sensor.yaml").open("a") as file:
+        file.write("line_delay_nanoseconds: 100000\nreadout_direction: right_to_left\n")
+    assert resolve_profile(read_capture(sequence))[0].shutter.readout_time_s == pytest.approx(96 * 1e-4)
+
+
 def test_exposures_of_tum_vi_join_by_time(sequence):
     """dso/cam0/times.txt gives exposures in milliseconds, whatever order or holes it has."""
     times = [f"{t} {t // 10**9}.{t % 10**9:09d} {0.5 + k}" for k, t in enumerate(stamps(8)) if k != 4]

@@ -134,6 +134,16 @@ def test_arkit_app(tmp_path, transposed):
     assert any(note.code == "stamps-slid" for note in capture.notes)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", ["0,0", "null,null", "1920,-1280"])
+def test_arkit_pictures_of_no_size_have_no_known_lens(tmp_path, size):
+    """And numpy warns of nothing."""
+    write_arkit(tmp_path / "rec")
+    path = tmp_path / "rec/frames.csv"
+    path.write_text(path.read_text().replace("1920,1280", size))
+    assert resolve_profile(read_capture(tmp_path / "rec"))[0].intrinsics is None
+
+
 def test_arkit_times_of_a_long_uptime_have_a_grid_of_a_millisecond(tmp_path):
     """After 28 hours nine digits leave 1 ms; frames are exact by the movie, and the grid is said."""
     uptime_s = write_arkit(tmp_path / "rec", uptime_s=912_345.678123, spare=0)

@@ -177,7 +177,9 @@ def _read_arkit_frames(path: Path, movie: MovieIndex) -> tuple[Rows, _Lens]:
     rows = read_rows(path, places, times=_seconds, error=CaptureError)
     if not len(rows.time_ns):
         raise CaptureError(f"{label(path)}: has no rows", hint="the recording was not stopped, or the copy was cut")
-    fx, fy, cx_a, cx_b, cy_a, cy_b, width, height = rows.values.T
+    *lens_px, width, height = rows.values.T
+    fx, fy, cx_a, cx_b, cy_a, cy_b = lens_px
+    width, height = (np.where(side > 0, side, np.nan) for side in (width, height))
     # K's last column in either index order of the header: the other entries are zero
     cx, cy = np.where(np.abs(cx_a) > np.abs(cx_b), cx_a, cx_b), np.where(np.abs(cy_a) > np.abs(cy_b), cy_a, cy_b)
     scale_x, scale_y = movie.width / width, movie.height / height
