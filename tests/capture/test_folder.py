@@ -244,6 +244,27 @@ def test_repeats_of_a_still_phone_mean_nothing(writer):
     assert capture.notes == ()
 
 
+@pytest.mark.parametrize(
+    ("exposure", "says"),
+    [("10", "times such as 1e-08 s"), ("0.005", "times such as 5e-12 s"), ("null", "has no"), ("0", "has no")],
+)
+def test_exposures_in_other_units_are_not_called_missing(writer, exposure, says):
+    """Milliseconds or seconds under the header of nanoseconds."""
+    writer.exposure_ns = exposure
+    capture = read_capture(writer.write())
+    assert says in next(note.text for note in capture.notes if note.code == "exposure-unknown")
+
+
+def test_a_link_to_no_movie_is_called_one(writer):
+    """The advice was to rename movie.mp4 to movie.mp4."""
+    writer.write()
+    (writer.folder / "movie.mp4").unlink()
+    (writer.folder / "movie.mp4").symlink_to("gone.mp4")
+    with pytest.raises(VideoError) as caught:
+        read_capture(writer.folder)
+    assert "a link to a file that is not there" in caught.value.hint
+
+
 def write_unix_columns(writer: CaptureWriter, lags_ms: list[int], cut: int = 0) -> None:
     """Stamps and metadata with times since 1970, the encoder's later by these; ``cut`` bytes are lost at the end."""
     stamps = [

@@ -40,7 +40,10 @@ def summarise(files: Source, notes: list[Note]) -> CaptureMetadata:
     if logged_s is None and readout_s is None:
         notes.append(Note("info", "readout-unknown", f"{name} has no readout time"))
     if _median(table.exposure_s) is None:
-        notes.append(Note("warning", "exposure-unknown", f"{name} has no exposure times: no deblurring"))
+        why = "has no exposure times"
+        if table.odd_exposure_s is not None:
+            why = f"has exposure times such as {table.odd_exposure_s:.3g} s (are they in the header's unit?)"
+        notes.append(Note("warning", "exposure-unknown", f"{name} {why}: no deblurring"))
     return CaptureMetadata(
         fx_px=fx,
         fy_px=fy,

@@ -82,6 +82,8 @@ class MetadataTable:
     """(n,) time of the capture result, 0 if unreadable; None: no such column."""
     rows: int
     dropped: dict[str, int] = field(default_factory=dict)
+    odd_exposure_s: float | None = None
+    """The first logged exposure that no camera has, such as one in other units; None: there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,4 +377,7 @@ def make_metadata_table(
     for name, (low, high) in PLAUSIBLE.items():
         given = columns.get(name, np.full(len(time_ns), np.nan))
         values[name] = np.where((given >= low) & (given <= high), given, np.nan)
-    return MetadataTable(time_ns, **values, unix_ns=unix_ns, rows=rows, dropped=dropped)
+    logged = columns.get("exposure_s", np.zeros(0))
+    odd = logged[(logged > 0) & ~np.isfinite(values["exposure_s"])] if len(logged) else logged
+    odd_s = float(odd[0]) if len(odd) else None
+    return MetadataTable(time_ns, **values, unix_ns=unix_ns, rows=rows, dropped=dropped, odd_exposure_s=odd_s)
