@@ -128,6 +128,8 @@ def finish_pictures(
                 for place in (run.picture(line["frame"]), run.mask(line["frame"])):
                     _crop_file(place, crop_px)
     film = options.film_of(name) if lines else None
+    if options.crop and crop_px is None and film is not None:
+        raise OutputError("--crop: no frame was written that shows the video's area", hint="omit --crop")
     if film is not None:
         rotation = display_matrix(movie)
         first_ns = lines[0]["timestamp_ns"]
