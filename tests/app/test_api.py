@@ -14,7 +14,7 @@ import virest
 from virest.app.api_records import CalibratedFacts, CalibrationFacts, SimulationFacts, SimulationOptions
 from virest.app.simulate import simulate_command
 from virest.camera.response import ResponseCurve
-from virest.errors import CalibrationError, CaptureError, SettingsError
+from virest.errors import CalibrationError, CaptureError, ImuError, SettingsError
 from virest.simulation.phone_isp import make_isp
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "leaves"
@@ -122,6 +122,42 @@ def test_invalid_arguments_raise_errors_with_a_hint() -> None:
         capture.restore(0, shuter="none")
     with pytest.raises(CaptureError, match="no frame 99"):
         capture.read_frame(99)
+    for nothing, kernel in ((np.zeros((0, 64), np.uint8), np.ones((1, 9))), (np.zeros((64, 64), np.uint8), [[]])):
+        with pytest.raises(SettingsError):
+            virest.deblur(nothing, np.array(kernel))
+    with pytest.raises(SettingsError, match=r"settings: deblur: .*'nope'"):
+        capture.restore(0, deblur="nope")
+    with pytest.raises(SettingsError, match="the profile: image 64x48"):
+        virest.open(SAMPLE, virest.CameraProfile(64, 48))
+
+
+def test_numbers_that_cannot_be_are_refused_by_restore() -> None:
+    """They came out as errors of numpy, or, of samples in the wrong order, as a wrong picture."""
+    capture = virest.open(SAMPLE)
+    imu, picture = capture.imu, np.zeros((1280, 720), np.uint8)
+
+    def restore(imu: virest.ImuSamples, time_s: float = 0.0, exposure_s: float = 0.01) -> None:
+        virest.restore(picture, imu, capture.profile, time_s=time_s, exposure_s=exposure_s)
+
+    for times in ((np.nan, 0.01), (0.0, np.nan), (0.0, -1.0), (0.0, 1e9)):
+        with pytest.raises(SettingsError, match=r"time_s is nan|exposure_s is"):
+            restore(imu, *times)
+    wrong = {
+        "of shapes": virest.ImuSamples(imu.time_s, imu.gyro_rad_s[:5], imu.accel_m_s2),
+        "not finite": virest.ImuSamples(imu.time_s, imu.gyro_rad_s * np.nan, imu.accel_m_s2),
+        "do not rise at row 1": virest.ImuSamples(imu.time_s[::-1], imu.gyro_rad_s, imu.accel_m_s2),
+    }
+    for says, samples in wrong.items():
+        with pytest.raises(ImuError, match=says):
+            restore(samples)
+
+
+def test_settings_given_by_name_hold() -> None:
+    """The number of neighbours no longer sets aside a given limit; numpy's numbers count as numbers."""
+    from virest.app.api import _settings
+
+    assert _settings("balanced", {"neighbours": np.int64(3), "most_joined": 2}).most_joined == 2
+    assert _settings("balanced", {"neighbours": 3}).most_joined == 6
 
 
 def test_calibrate_returns_the_record_and_writes_only_on_request(

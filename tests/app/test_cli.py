@@ -119,6 +119,9 @@ def test_help_of_a_group_truncates_no_description(capsys: pytest.CaptureFixture[
         (["process", "x", "--jobs", "0"], "--jobs"),
         (["process", "x", "--resume", "--overwrite"], "--resume"),
         (["inspect", "--deep", "x"], "--deep"),
+        (["preview", "x", "--out", "p.jpg"], "end in .png"),
+        (["profile", "new", "x", "--size", "64x48"], "CAPTURE and --size"),
+        (["profile", "new", "--size", "64x48", "--focal-px", "50", "--fov-deg", "60"], "--focal-px and --fov-deg"),
     ],
 )
 def test_a_usage_error_prints_one_line_and_exits_with_2(virest: Virest, arguments: list[str], says: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -13,9 +14,19 @@ import pytest
 from laws import RADTAN, phone
 
 from virest.app.film import UPRIGHT, display_matrix, side_by_side, write_film
-from virest.app.finish import cropped_profile
+from virest.app.finish import (
+    Finished,
+    FinishOptions,
+    common_rectangle,
+    cropped_profile,
+    finish_pictures,
+    require_finishable,
+)
 from virest.app.names import batch_names, shard_of
+from virest.app.preview import PreviewOptions, run_preview
+from virest.app.run_folder import RunFolder
 from virest.camera.field import Field
+from virest.capture.video import MovieIndex
 from virest.errors import OutputError
 
 FAST = ("--preset", "fast", "--jobs", "1")
@@ -131,6 +142,30 @@ def test_masks_and_crop_separate_recorded_from_repeated_pixels(swing: Path, vire
     assert report.returncode == 0, report.stderr
 
 
+@pytest.mark.parametrize("link", [False, True])
+def test_outputs_never_replace_the_recording(tiny: Path, tmp_path: Path, link: bool) -> None:
+    """A film or preview is refused there, even with --overwrite or through a link."""
+    capture, target = shutil.copytree(tiny, tmp_path / "own"), tmp_path / "own" / "movie.mp4"
+    before = target.read_bytes()
+    if link:
+        target = tmp_path / "film.mp4"
+        target.symlink_to(capture / "movie.mp4")
+    with pytest.raises(OutputError, match="belongs to the recording"):
+        require_finishable(FinishOptions(str(target)), "own", tmp_path / "run", [capture / "movie.mp4"], overwrite=True)
+    with pytest.raises(OutputError, match="belongs to the recording"):
+        run_preview(str(capture), PreviewOptions(target, overwrite=True))
+    assert (capture / "movie.mp4").read_bytes() == before
+
+
+def test_a_run_without_pictures_has_nothing_to_finish(tmp_path: Path) -> None:
+    """No film is reported, and skipped frames need no crop."""
+    nothing = MovieIndex(16, 16, Fraction(1, 30), np.zeros(1, np.int64), (0,), (0,))
+    options = FinishOptions(str(tmp_path / "film.mp4"), crop=True)
+    run = RunFolder(tmp_path / "run")
+    assert finish_pictures(run, [], tmp_path / "movie.mp4", nothing, options, "run") == Finished()
+    assert common_rectangle([{"output": None, "valid_px": None}]) is None
+
+
 def test_a_crop_keeps_the_lens() -> None:
     """A ray projects to the same point of the cropped frame, including distortion and displacement."""
     bent = Field("displacement", ("x", "y"), ((0.0, 70.0, 199.0), (0.0, 135.0)), ((1.0, 2.0), (0.5, -1.0)) * 3)
@@ -166,6 +201,7 @@ def test_a_run_with_other_outputs_is_not_resumed(tiny: Path, virest_here, tmp_pa
     [
         (["--side-by-side"], "--side-by-side needs --video"),
         (["--no-frames"], "--no-frames needs --video"),
+        (["--video", "film.avi"], "an MP4 is written; name it *.mp4"),
         (["--shard", "3/2"], "not a shard"),
         (["--frames", "x"], "not a slice"),
     ],

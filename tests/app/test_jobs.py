@@ -139,7 +139,7 @@ def test_imu_samples_cover_the_frames_on_the_imus_clock() -> None:
 
 
 def test_the_whole_log_tells_the_noise_of_a_gyroscope_with_a_low_pass() -> None:
-    """A filter is undone on denoised samples: with part of the log a frame would differ by the selection of frames."""
+    """The filter is undone on denoised samples, so with part of the log a frame would depend on the selection."""
     imu = ImuSamples(np.arange(0, 100, 0.01), np.zeros((10000, 3)), np.zeros((10000, 3)))
     profile = CameraProfile(64, 48, time_offset_s=50.0).with_extensions(gyro_lowpass_hz=20.0)
     assert len(cut_imu(imu, frames_of(0, 30), RestorationPlan(profile, RestorationSettings(), (), None))) == len(imu)

@@ -13,7 +13,11 @@ import numpy as np
 import pytest
 
 from virest.app import outputs, run_folder
-from virest.app.outputs import capture_name, json_line, plain, write_picture, write_whole
+from virest.app.calibrate import CalibrationOutput
+from virest.app.diagnose import DiagnosisOptions, run_diagnosis
+from virest.app.evaluate_shutter import ShutterOptions, run_shutter
+from virest.app.evaluate_slam import SlamOptions, run_slam
+from virest.app.outputs import capture_name, json_line, plain, require_file, write_picture, write_whole
 from virest.app.run_folder import RunFolder, check_run, opened_run, write_failure
 from virest.errors import OutputError
 
@@ -302,3 +306,43 @@ def test_an_output_path_that_is_a_file_is_refused(tmp_path: Path, taken: str) ->
     with pytest.raises(OutputError), opened_run(RunFolder(tmp_path / "out" / "trip"), REQUEST, "overwrite"):
         pass
     assert (tmp_path / taken).read_text() == "mine"
+
+
+# ── before the work ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _start(command: str, out: Path) -> None:
+    """Begin a command whose capture does not exist, so that only checks of its output can come first."""
+    match command:
+        case "calibrate":
+            CalibrationOutput(out / "camera.yaml").require()
+        case "diagnose":
+            run_diagnosis("walk", DiagnosisOptions(out))
+        case "file":
+            require_file(out / "picture.png", overwrite=False)
+        case "shutter":
+            run_shutter(ShutterOptions(("walk",), out=out))
+        case "slam":
+            run_slam([Path("walk")], SlamOptions(command="true {sequence} {trajectory}", out=out))
+
+
+COMMANDS = ["calibrate", "diagnose", "file", "shutter", "slam"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_output_that_cannot_be_written_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """A fit of minutes was lost, or ended in a traceback, where the folder takes no files."""
+    out = tmp_path if command in ("calibrate", "file") else tmp_path / "new" / "deep"
+    monkeypatch.setattr(os, "access", lambda *_arguments: False)
+    with pytest.raises(OutputError, match=f"no permission to write in {tmp_path}, or the disk is read-only"):
+        _start(command, out)
+
+
+@pytest.mark.parametrize("command", ["diagnose", "shutter", "slam"])
+def test_an_output_below_a_file_is_refused_before_the_work(tmp_path: Path, command: str) -> None:
+    """The file is named."""
+    (tmp_path / "notes").write_text("mine")
+    with pytest.raises(OutputError, match="notes is a file"):
+        _start(command, tmp_path / "notes" / "out" / "deep")

@@ -65,6 +65,16 @@ def test_an_existing_curve_is_replaced_only_on_request(tmp_path: Path) -> None:
     assert out.read_text() == "mine"
 
 
+def test_curve_and_plot_need_two_names_and_spare_the_list(tmp_path: Path) -> None:
+    """One name for both is refused, and so is the list of exposures as the output."""
+    figure, exposures = tmp_path / "curve.png", tmp_path / "exposures.csv"
+    with pytest.raises(OutputError, match="named by both --out and --plot"):
+        calibrate_curve(tmp_path, out=figure, plot=figure)
+    exposures.write_text("file,exposure_s\n")
+    with pytest.raises(OutputError, match="belongs to the recording"):
+        calibrate_curve(tmp_path, exposures=exposures, out=exposures, overwrite=True)
+
+
 def test_a_stabilised_movie_must_be_recorded_again() -> None:
     """The advice is to switch stabilisation off. It does not name a calibration, which would be refused."""
     unknown = replace(recorded(Setup(seed=3, frames=6)).profile, time_offset_s=None)

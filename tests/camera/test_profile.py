@@ -146,7 +146,7 @@ def _profiles(draw: st.DrawFn) -> CameraProfile:
     width, height = draw(st.integers(16, 4000)), draw(st.integers(16, 4000))
     model = draw(st.sampled_from(sorted(COEFFICIENT_NAMES)))
     lens = Intrinsics(
-        width, height, *some(1, 1e5, 2), *some(-1e4, 1e4, 2), model, some(-1, 1, len(COEFFICIENT_NAMES[model]))
+        width, height, *some(200, 1e5, 2), *some(-1e4, 1e4, 2), model, some(-1, 1, len(COEFFICIENT_NAMES[model]))
     )
     curve = ResponseCurve(
         draw(st.sampled_from(["linear", "srgb", "gamma"])),
@@ -345,6 +345,8 @@ WRONG = {
     "true for number": "shutter: {readout_time_s: true}",
     "nan": "shutter: {readout_time_s: .nan}",
     "infinite readout": "shutter: {readout_time_s: .inf}",
+    "decimal point missing": "intrinsics: {fx_px: 100, cx_px: 31500}",
+    "picture behind the lens": "intrinsics: {fx_px: 100, fy_px: 1.0e-3}",
     "infinite focal length as text": "intrinsics: {fx_px: inf}",
     "nan depth": "scene: {depth_m: nan}",
     "depth behind": "scene: {depth_m: -1}",

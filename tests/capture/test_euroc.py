@@ -81,6 +81,13 @@ def test_the_path_selects_the_camera(tmp_path, part):
     assert profile.shutter.readout_time_s == pytest.approx(64 * 29473.7e-9 if part.endswith("cam1") else 0.0)
 
 
+def test_lines_of_a_camera_read_sideways_are_columns(sequence):
+    """The line delay then counts once per column."""
+    with (sequence / "mav0/cam0/sensor.yaml").open("a") as file:
+        file.write("line_delay_nanoseconds: 100000\nreadout_direction: right_to_left\n")
+    assert resolve_profile(read_capture(sequence))[0].shutter.readout_time_s == pytest.approx(96 * 1e-4)
+
+
 def test_exposures_of_tum_vi_are_joined_by_time(sequence):
     """dso/cam0/times.txt gives exposures in milliseconds; a missing row is interpolated."""
     times = [f"{t} {t // 10**9}.{t % 10**9:09d} {0.5 + k}" for k, t in enumerate(stamps(8)) if k != 4]

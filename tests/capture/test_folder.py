@@ -116,6 +116,15 @@ def test_timestamps_of_another_movie_are_refused(writer):
         read_capture(writer.folder)
 
 
+def test_stamps_that_end_early_are_said_to(writer):
+    """If all rows match the first frames, the file is truncated, not from another recording."""
+    writer.write()
+    writer.stamps_ns = writer.stamps_ns[:5]
+    writer.write_stamps()
+    with pytest.raises(ClockError, match=r"matches more than 5 of them; frame_timestamps.txt lacks most of its rows"):
+        read_capture(writer.folder)
+
+
 def test_metadata_of_another_session_are_refused(writer):
     """If no metadata row joins a frame, the files are from different sessions."""
     writer.write()
@@ -235,21 +244,56 @@ def test_repeats_of_a_still_phone_mean_nothing(writer):
     assert capture.notes == ()
 
 
-def test_start_up_lag_from_the_unix_columns_alone(writer):
-    """Frames that leave the encoder later than usual are marked until the delay has settled."""
+@pytest.mark.parametrize(
+    ("exposure", "says"),
+    [("10", "times such as 1e-08 s"), ("0.005", "times such as 5e-12 s"), ("null", "has no"), ("0", "has no")],
+)
+def test_exposures_in_other_units_are_not_called_missing(writer, exposure, says):
+    """The note quotes milliseconds or seconds found under a header of nanoseconds."""
+    writer.exposure_ns = exposure
+    capture = read_capture(writer.write())
+    assert says in next(note.text for note in capture.notes if note.code == "exposure-unknown")
+
+
+def test_a_link_to_no_movie_is_called_one(writer):
+    """The hint names the missing target."""
     writer.write()
-    lags_ms = [300, 260, 200, 160, 130, *[100] * 25]
+    (writer.folder / "movie.mp4").unlink()
+    (writer.folder / "movie.mp4").symlink_to("gone.mp4")
+    with pytest.raises(VideoError) as caught:
+        read_capture(writer.folder)
+    assert "a link to a file that is not there" in caught.value.hint
+
+
+def write_unix_columns(writer: CaptureWriter, lags_ms: list[int], cut: int = 0) -> None:
+    """Write stamps and metadata with times since 1970; the encoder's are later by ``lags_ms``, ``cut`` bytes are missing."""
     stamps = [
         f"{s // 1000 * 1000},{10**18 + s + lag * 10**6}" for s, lag in zip(writer.stamps_ns, lags_ms, strict=True)
     ]
-    writer.text("frame_timestamps.txt", ["Frame timestamp[nanosec],Unix time[nanosec]", *stamps])
+    path = writer.text("frame_timestamps.txt", ["Frame timestamp[nanosec],Unix time[nanosec]", *stamps])
+    path.write_bytes(path.read_bytes()[: -cut or None])
     rows = [
         f"{t},80,80,{n},5000000,33333333,20000000,144,3.95,0.1,3,{10**18 + t}" for n, t in enumerate(writer.metadata_ns)
     ]
     writer.text("movie_metadata.csv", [METADATA_11 + ",Unix time[nanosec]", *rows])
+
+
+def test_startup_lag_from_unix_columns_alone(writer):
+    """Frames that leave the encoder later than usual are marked until the delay has settled."""
+    writer.write()
+    write_unix_columns(writer, [300, 260, 200, 160, 130, *[100] * 25])
     capture = read_capture(writer.folder, look_at_pictures=False)
     assert skipped(capture) == [0, 1, 2, 3]
     assert capture.startup_lag_s == pytest.approx(0.2, abs=0.001)
+
+
+@pytest.mark.parametrize("cut", [4, 12])
+def test_a_cut_unix_time_is_no_startup(tmp_path, cut):
+    """The truncated last number is ignored: as a lag of thirty years it would mark every frame as start-up."""
+    writer = CaptureWriter(tmp_path / "short", count=12)
+    writer.write()
+    write_unix_columns(writer, [100] * 12, cut)
+    assert len(read_capture(writer.folder, look_at_pictures=False).usable) == 12
 
 
 def test_default_profile_follows_the_orientation(writer):

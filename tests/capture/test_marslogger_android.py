@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -242,6 +243,32 @@ def test_a_truncated_last_timestamp_is_dropped(tmp_path):
     assert table.dropped == {"time falls or leaps": 1}
 
 
+def test_a_cut_last_number_is_unknown(tmp_path):
+    """An exposure of which half was copied still parses; the numbers before it are whole."""
+    header = METADATA_HEADERS["v1"][0]
+    row = "980.4,981.5,205,10000000,33333333,20733000,144,3.95,0.16,3"
+    table = read_movie_metadata(put(tmp_path, f"{header}\n{T},{row}\n{T + 1},{row[:19]}"))
+    assert table.exposure_s.tolist() == pytest.approx([0.01, math.nan], nan_ok=True)
+    assert table.fx_px.tolist() == [980.4, 980.4]
+    whole = read_movie_metadata(put(tmp_path, f"{header}\n{T},{row}\n{T + 1},{row}"))
+    assert whole.exposure_s.tolist() == [0.01, 0.01]
+
+
+@pytest.mark.parametrize("rows_too", [False, True])
+def test_quoted_fields_are_read(tmp_path, rows_too):
+    """R quotes the header, other writers every field."""
+
+    def quoted(row: str) -> str:
+        return ",".join(f'"{field}"' for field in row.split(","))
+
+    rows = [f"{T + k},0.1,-0.2,8.2E-4,1.0,9.8,-0.5" for k in range(3)]
+    text = "\n".join([quoted(GYRO_TIGHT), *(map(quoted, rows) if rows_too else rows)]) + "\n"
+    table = read_gyro_accel(put(tmp_path, text))
+    assert table.time_ns.tolist() == [T, T + 1, T + 2]
+    assert table.gyro_rad_s[0].tolist() == [0.1, -0.2, 8.2e-4]
+    assert table.dropped == {}
+
+
 def test_edge_epochs_with_repeated_block(tmp_path):
     """The source and the mean of all difference rows are read, including appended blocks."""
     block = (
@@ -321,8 +348,13 @@ def test_a_single_leap_drops_one_row():
 def test_times_that_mostly_fall_are_refused(tmp_path):
     """A table with falling times is an error."""
     rows = "".join(f"{100 - i},1,1,1,1,1,1\n" for i in range(20))
-    with pytest.raises(ClockError, match="of 20 times rise"):
+    with pytest.raises(ClockError, match="of 20 times rise") as caught:
         read_gyro_accel(put(tmp_path, GYRO_TIGHT + "\n" + rows))
+    assert "out of order" in caught.value.hint
+    rows = "".join(f"{100 + i // 4},{i},1,1,1,1,1\n" for i in range(20))
+    with pytest.raises(ClockError, match="5 of 20 times rise") as caught:
+        read_gyro_accel(put(tmp_path, GYRO_TIGHT + "\n" + rows))
+    assert "spreadsheet" in caught.value.hint
 
 
 def test_old_real_text_files(realdata):

@@ -89,6 +89,14 @@ def test_unknown_intrinsics_of_old_phones(tmp_path):
     assert resolve_profile(read_capture(tmp_path / "rec"))[0].intrinsics is None
 
 
+@pytest.mark.parametrize("fy", ["null", "0", "-75.2", "9000000"])
+def test_an_implausible_focal_length_is_not_used(tmp_path, fy):
+    """fy is then taken from fx, for square pixels."""
+    write_objective_c(tmp_path / "rec", lens=f"75.10, {fy}, 47.30, 31.70")
+    lens = resolve_profile(read_capture(tmp_path / "rec"))[0].intrinsics
+    assert (lens.fx_px, lens.fy_px) == (75.1, 75.1)
+
+
 def test_32_bit_seconds_are_corrected_with_the_movie(tmp_path):
     """Before June 2019 times were rounded to a grid of 8 ms; the movie's PTS remove the rounding."""
     stamps = write_objective_c(tmp_path / "rec", seconds=True)
@@ -127,6 +135,16 @@ def test_arkit_app(tmp_path, transposed):
     assert lens is not None
     np.testing.assert_allclose([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px], [75.0, 75.1, 47.3, 31.6])
     assert any(note.code == "stamps-slid" for note in capture.notes)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", ["0,0", "null,null", "1920,-1280"])
+def test_arkit_pictures_of_no_size_have_no_known_lens(tmp_path, size):
+    """There is no numpy warning."""
+    write_arkit(tmp_path / "rec")
+    path = tmp_path / "rec/frames.csv"
+    path.write_text(path.read_text().replace("1920,1280", size))
+    assert resolve_profile(read_capture(tmp_path / "rec"))[0].intrinsics is None
 
 
 def test_arkit_times_after_a_long_uptime_are_coarse(tmp_path):

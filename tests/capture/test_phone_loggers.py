@@ -11,7 +11,7 @@ from other_writing import write_film
 from virest.capture.detect import choose_reader
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.sensor_logger import named_start_ns
-from virest.errors import CaptureError, ImuError, VideoError
+from virest.errors import CaptureError, ClockError, ImuError, VideoError
 
 COUNT = 16
 EPOCH_MS = 1_770_510_090_123
@@ -63,6 +63,22 @@ def test_ios_accelerations_change_their_sign(sensor_logger: Path) -> None:
     assert np.isnan(read_capture(sensor_logger).imu.accel_m_s2).all()
     (sensor_logger / "Gravity.csv").write_text(csv_rows(start_ns, "zyx", (1.0, -9.0, 0.5)))
     np.testing.assert_allclose(read_capture(sensor_logger).imu.accel_m_s2[5], (-1.1, 8.8, -0.8))
+
+
+def test_quoted_tables_of_sensor_logger_are_read(sensor_logger: Path) -> None:
+    """As R and other writers leave them."""
+    for path in sensor_logger.glob("*.csv"):
+        rows = [",".join(f'"{field}"' for field in line.split(",")) for line in path.read_text().splitlines()]
+        path.write_text("\n".join(rows) + "\n")
+    np.testing.assert_allclose(read_capture(sensor_logger).imu.gyro_rad_s[5], RATES)
+
+
+def test_nanoseconds_that_were_floats_are_refused(sensor_logger: Path) -> None:
+    """The time is named; the gyroscope was blamed."""
+    path = sensor_logger / "Gyroscope.csv"
+    path.write_text(path.read_text().replace("3000000,", "3000000.0,"))
+    with pytest.raises(ClockError, match=r"time '\d+\.0' has lost its digits"):
+        read_capture(sensor_logger)
 
 
 @pytest.mark.parametrize(
@@ -134,6 +150,41 @@ def test_the_error_for_an_opencamera_folder_names_the_missing_movie(open_camera:
         read_capture(open_camera)
 
 
+@pytest.mark.parametrize("open_camera", ["beside"], indirect=True)
+def test_what_an_opencamera_table_loses_is_counted(open_camera: Path) -> None:
+    """Rows without numbers, out of order or twice are dropped with their reason; the header is no row."""
+    gyro, stamps = (next(open_camera.glob(f"*_{name}.csv")) for name in ("gyro", "timestamps"))
+    rows = gyro.read_text().splitlines()
+    rows[100], rows[200], rows[300] = rows[100].replace("0.1,", "nan,"), "cut", rows[310]
+    gyro.write_text("\n".join(["X,Y,Z,time", *rows]) + "\n")
+    times = stamps.read_text().splitlines()
+    stamps.write_text("\n".join([*times[:5], times[4], *times[5:]]) + "\n")
+    capture = read_capture(open_camera)
+    dropped = {key: number for key, number in capture.counts.items() if "dropped" in key}
+    assert dropped == {
+        f"{gyro.name} dropped: cut or unreadable row": 2,
+        f"{gyro.name} dropped: time falls or leaps": 1,
+        f"{stamps.name} dropped: time equals its predecessor's": 1,
+    }
+    assert len(capture.usable) == COUNT
+    assert capture.counts["gyro_rows"] == len(rows)
+
+
+@pytest.mark.parametrize("open_camera", ["beside"], indirect=True)
+@pytest.mark.parametrize("name", ["gyro", "accel", "timestamps"])
+def test_opencamera_tables_are_read_within_bounds(open_camera: Path, name: str) -> None:
+    """Endless lines, bytes that are no text, folders and pipes are refused before they are read."""
+    path = next(open_camera.glob(f"*_{name}.csv"))
+    for content, says in ((b"1," * 40_000, "a line has more than"), (b"\0\n", "has NUL bytes")):
+        path.write_bytes(content)
+        with pytest.raises(CaptureError, match=says):
+            read_capture(open_camera)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(CaptureError, match="is a folder"):
+        read_capture(open_camera)
+
+
 # ── Stray Scanner ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -166,6 +217,14 @@ def test_a_stray_scan_is_read(tmp_path: Path, gravity: float) -> None:
     assert (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px) == (110.5, 111.0, 63.0, 48.5)
 
 
+def test_rows_that_a_scan_loses_are_counted(tmp_path: Path) -> None:
+    """Rows of the frames' file too, which has no metadata beside it."""
+    folder = write_scan(tmp_path / "scan", 1.0)
+    rows = (folder / "odometry.csv").read_text().splitlines()
+    (folder / "odometry.csv").write_text("\n".join([*rows[:5], rows[4], *rows[5:]]) + "\n")
+    assert read_capture(folder).counts["odometry.csv dropped: time equals its predecessor's"] == 1
+
+
 def test_accelerations_without_gravity_are_not_used(tmp_path: Path) -> None:
     """Values in an unknown unit are left out with a note."""
     capture = read_capture(write_scan(tmp_path / "scan", 0.05))
@@ -176,7 +235,9 @@ def test_accelerations_without_gravity_are_not_used(tmp_path: Path) -> None:
 def test_a_damaged_matrix_is_an_error(tmp_path: Path) -> None:
     """Text, or intrinsics of another picture size, are rejected."""
     folder = write_scan(tmp_path / "scan", 1.0)
-    for text, says in (("one, two\n", "not a 3 x 3 matrix"), ("9e4,0,1\n0,9e4,1\n0,0,1\n", "do not fit a 128x96")):
+    wrong = ("9e4,0,1\n0,9e4,1", "110,0,63\n0,0,48", "110,0,63\n0,nan,48", "110,0,63\n0,1e9,48")
+    cases = [("one, two\n", "not a 3 x 3 matrix"), *((f"{text}\n0,0,1\n", "do not fit a 128x96") for text in wrong)]
+    for text, says in cases:
         (folder / "camera_matrix.csv").write_text(text)
         with pytest.raises(CaptureError, match=says):
             read_capture(folder)

@@ -69,6 +69,14 @@ def test_every_timestamp_format_gives_the_same_capture(tmp_path, kind, samples):
         np.testing.assert_array_equal(picture, pictures[number])
 
 
+def test_a_quoted_list_is_read(tmp_path):
+    """CSV writers put names in quotes."""
+    write_pictures(tmp_path, [f"p{k}.png" for k in range(6)])
+    rows = [f'{time},"p{k}.png"' for k, time in enumerate(stamps(6))]
+    (tmp_path / "data.csv").write_text("\n".join(['"time","name"', *rows]) + "\n")
+    assert read_picture_list(tmp_path / "data.csv").names == tuple(f"p{k}.png" for k in range(6))
+
+
 def test_timestamps_in_order_need_one_picture_each(tmp_path):
     """With a surplus picture the assignment of timestamps is ambiguous."""
     write_pictures(tmp_path, [f"{k}.png" for k in range(7)])

@@ -115,7 +115,7 @@ def test_a_delay_over_row_and_time_is_the_same_everywhere() -> None:
 
 @pytest.mark.parametrize("covariates", [("row",), ("row", "time")])
 def test_the_motion_over_a_frame_reaches_to_its_latest_row(covariates: tuple[str, ...]) -> None:
-    """Also where a row is later than an even readout by more than a quarter of it."""
+    """A row may be later than in an even readout by more than a quarter of the readout."""
     knots = ((0.0, 1.0),) * len(covariates)
     values = ((0.0,), (0.014,)) if len(knots) == 1 else ((0.0,), (0.0,), (0.014,), (0.014,))
     profile = CAMERA.with_fields([Field("delay", covariates, knots, values)])

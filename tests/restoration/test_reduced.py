@@ -82,7 +82,7 @@ def test_tiles_are_as_large_as_their_kernels_allow() -> None:
 
 
 def test_tiles_are_smaller_where_flicker_moves_the_light_along_the_paths() -> None:
-    """The faster the light changes from row to row, the smaller; light that is the same in all rows changes nothing."""
+    """The side shrinks with the change of light from row to row; constant light does not matter."""
 
     def side_px(per_row_rad: float) -> float:
         def field(centres_px: NDArray[np.float64]) -> KernelField:

@@ -6,6 +6,7 @@ The functions raise the errors of :mod:`virest.errors`; each carries a hint.
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,8 +20,8 @@ from virest.arrays import Picture
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame, read_capture, resolve_profile
-from virest.capture.imu import ImuSamples
-from virest.capture.profile_source import read_any_profile
+from virest.capture.imu import ImuSamples, checked_samples
+from virest.capture.profile_source import read_any_profile, require_size
 from virest.capture.records import Capture as CaptureRecord
 from virest.capture.records import Note
 from virest.capture.video import MovieIndex, probe_movie, read_frames
@@ -35,6 +36,8 @@ from virest.restoration.one_kernel import as_colour, deblur_along, even_path, pa
 from virest.restoration.settings import PRESETS, RestorationSettings
 
 PathLike = str | os.PathLike[str]
+LONGEST_EXPOSURE_S = 10.0
+"""As of a recorder's log."""
 
 
 class Capture:
@@ -138,6 +141,7 @@ def open(path: PathLike, config: PathLike | CameraProfile | None = None) -> Capt
     """
     record = read_capture(Path(path))
     if isinstance(config, CameraProfile):
+        require_size(config, record, "the profile")
         return Capture(record, config, "given")
     profile, source = resolve_profile(record, None if config is None else Path(config))
     return Capture(record, profile, str(source))
@@ -174,8 +178,9 @@ def restore(
             raise SettingsError(
                 f"the profile's {name} is unknown", hint="fit it with virest.calibrate, or use Capture.restore"
             )
+    _require_times(time_s, exposure_s)
     composed = _settings(preset, settings)
-    trajectory = motion if isinstance(motion, Trajectory) else integrate_gyro(motion, camera)
+    trajectory = motion if isinstance(motion, Trajectory) else integrate_gyro(checked_samples(motion), camera)
     lens = moving_lens(trajectory, camera)
     rows = row_motion(trajectory, camera, time_s, exposure_s, composed.reference, translation, lens)
     stamp = Frame(0, round(1e9 * time_s), time_s, exposure_s)
@@ -260,12 +265,21 @@ def simulate(out: PathLike, **options: Unpack[SimulationOptions]) -> SimulationF
     return cast(SimulationFacts, simulate_command(Path(out), **options))
 
 
+def _require_times(time_s: float, exposure_s: float | None) -> None:
+    if not math.isfinite(time_s):
+        raise SettingsError(f"time_s is {time_s}", hint="pass the frame's timestamp in seconds")
+    if exposure_s is not None and not 0.0 <= exposure_s <= LONGEST_EXPOSURE_S:
+        text = f"exposure_s is {exposure_s:g}, outside 0 to {LONGEST_EXPOSURE_S:g}"
+        raise SettingsError(text, hint="pass seconds, or None to straighten only")
+
+
 def _settings(preset: str, given: Mapping[str, Any]) -> RestorationSettings:
-    from virest.app.settings import compose_settings
+    from virest.app.settings import checked_settings, compose_settings
 
     unknown = set(given) - {field.name for field in dataclasses.fields(RestorationSettings)}
     if unknown:
         raise SettingsError(f"unknown setting '{sorted(unknown)[0]}'", hint="see the fields of RestorationSettings")
     if preset not in PRESETS:
         raise SettingsError(f"preset '{preset}' is unknown", hint=f"choose from {', '.join(PRESETS)}")
-    return compose_settings(None, preset=preset, **given)
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()}
+    return compose_settings(None, preset=preset, **checked_settings(plain, "settings"))

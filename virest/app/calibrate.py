@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from virest.app.console import table
-from virest.app.outputs import output_error, write_whole
+from virest.app.outputs import output_error, require_no_input, require_writable, write_whole
 from virest.calibration.calibrated_values import CalibratedValue
 from virest.calibration.geometry import FRAME_LAG, GeometryCalibration, calibrate_geometry
 from virest.calibration.unfitted_parameters import OPTIONAL
@@ -96,6 +96,7 @@ class CalibrationOutput:
                 raise OutputError(f"{path}: is a folder", hint="name a file")
             if path.exists() and not self.overwrite:
                 raise OutputError(f"{path}: exists already", hint="name another by --out, or pass --overwrite")
+            require_writable(path.absolute().parent)
 
 
 def unknown_extra(name: str) -> str | None:
@@ -158,6 +159,7 @@ def run_calibration(
     CalibrationError, OutputError; nothing is written then.
     """
     output.require()
+    require_no_input(output.profile, plan.capture.inputs)
     facts, found, noise = find_calibration(plan, progress, each)
     text = describe(facts)
     _write(output, facts, found, noise, plan.capture)

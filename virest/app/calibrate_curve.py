@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from virest.app.console import table
-from virest.app.outputs import require_file, write_whole
+from virest.app.outputs import require_file, require_no_input, write_whole
 from virest.calibration.bracket_samples import BracketPicture
 from virest.calibration.response_curve import CurveFit, fit_response
 from virest.camera.profile_file import response_block
@@ -17,7 +17,7 @@ from virest.camera.response import ResponseCurve
 from virest.capture.detect import is_capture
 from virest.capture.folder import read_capture
 from virest.capture.stills import Still, capture_bracket, read_bracket
-from virest.errors import CaptureError, SettingsError, printable
+from virest.errors import CaptureError, OutputError, SettingsError, printable
 from virest.report.figures import FORMATS, response_figure
 
 log = logging.getLogger(__name__)
@@ -42,7 +42,10 @@ def calibrate_curve(
     """
     for option, path in (("--out", out), ("--plot", plot)):
         if path:
+            require_no_input(path, [exposures] if exposures else [], option)
             require_file(path, overwrite=overwrite, option=option)
+    if out and plot and out.absolute() == plot.absolute():
+        raise OutputError(f"{out}: is named by both --out and --plot", hint="name two files")
     stills, notes = read_source(source, exposures)
     fit = fit_response([BracketPicture(s.file, s.levels, s.exposure) for s in stills], kind)
     facts = as_json(fit, stills, notes)

@@ -14,7 +14,7 @@ import numpy as np
 
 from virest.app.diagnosis_text import describe
 from virest.app.field_record import field_record
-from virest.app.outputs import capture_name, json_text, output_error, plain, write_whole
+from virest.app.outputs import capture_name, json_text, output_error, plain, require_writable, write_whole
 from virest.app.recreate import restored_scene
 from virest.app.run_folder import DIAGNOSIS, EXTENDED, FIGURE, FIGURES
 from virest.arrays import Picture
@@ -184,6 +184,7 @@ def require_free(folder: Path, overwrite: bool) -> None:
         raise OutputError(
             f"{folder}: already holds a diagnosis", hint="--overwrite replaces it, --out chooses another folder"
         )  # fmt: skip
+    require_writable(folder)
 
 
 def open_source(path: Path, config: Path | None = None) -> Source:

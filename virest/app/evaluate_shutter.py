@@ -13,6 +13,7 @@ import numpy as np
 from virest.app.console import cell, numeric_table
 from virest.app.difference_sheets import amplified_difference, labelled, write_sheet
 from virest.app.evaluation_captures import TrueCapture, open_true_capture, peer_versions, temporary_folder
+from virest.app.outputs import require_writable
 from virest.arrays import Array, Mask, Picture
 from virest.capture.pixels import luma_of
 from virest.capture.video import read_decodable_gray
@@ -86,6 +87,8 @@ class FrameResult:
 
 def run_shutter(options: ShutterOptions, progress: Progress | None = None) -> tuple[dict[str, Any], str]:
     """Evaluate captures with truth, or the standard set. Returns the facts and the text."""
+    if options.out is not None:
+        require_writable(options.out)
     results: list[FrameResult] = []
     missed: dict[str, int] = {}
     with _chosen_captures(options) as captures:

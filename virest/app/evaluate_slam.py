@@ -19,7 +19,7 @@ from virest import __version__
 from virest.app import console
 from virest.app.evaluation_captures import temporary_folder
 from virest.app.machine import installed_version
-from virest.app.outputs import json_line
+from virest.app.outputs import json_line, output_error, require_writable, write_whole
 from virest.app.slam_captures import (
     DEVICE_FRAMES,
     DEVICE_SOURCES,
@@ -100,7 +100,7 @@ def run_slam(
         facts = {**tools, "preset": options.preset, "sfm": sfm, "results": rows}
         facts["summary"] = _summary(rows)
         if options.out:
-            (out / "results.json").write_text(json_line(facts) + "\n", encoding="utf-8")
+            write_whole(out / "results.json", f"{json_line(facts)}\n".encode())
     return facts, describe(facts), console.batch_code([row.get("exit_code", 0) for row in rows])
 
 
@@ -238,7 +238,11 @@ def _work_folder(out: Path | None, stack: ExitStack) -> Path:
         return stack.enter_context(temporary_folder("virest-slam-"))
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise OutputError(f"{out} exists and is not empty", hint="choose another folder for --out")
-    out.mkdir(parents=True, exist_ok=True)
+    require_writable(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise output_error(out, error) from error
     return out
 
 

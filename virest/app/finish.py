@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from virest.app.film import display_matrix, side_by_side, write_film
-from virest.app.outputs import require_file, write_picture
+from virest.app.outputs import require_file, require_no_input, write_picture
 from virest.app.run_folder import RunFolder, parse_lines
 from virest.arrays import Picture
 from virest.camera.intrinsics import Intrinsics
@@ -94,12 +94,15 @@ def cropped_profile(profile: CameraProfile, crop_px: Crop) -> CameraProfile:
     return dataclasses.replace(profile, width=x1 - x0, height=y1 - y0, intrinsics=lens).with_fields(moved)
 
 
-def require_finishable(options: FinishOptions, name: str, run: Path, *, overwrite: bool) -> None:
-    """Raise OutputError, before any work, if the request cannot be fulfilled."""
+def require_finishable(
+    options: FinishOptions, name: str, run: Path, inputs: Iterable[Path], *, overwrite: bool
+) -> None:
+    """Raise OutputError, before any work, if the request cannot be fulfilled; inputs: the files that the run reads."""
     if options.any and is_remote(run):
         raise OutputError("--video and --crop need a local --out", hint="process to a folder, then upload")
     film = options.film_of(name)
     if film is not None:
+        require_no_input(film, inputs, "--video")
         require_file(film, overwrite=overwrite, option="--video")
 
 
@@ -124,8 +127,10 @@ def finish_pictures(
             if line["output"] is not None:
                 for place in (run.picture(line["frame"]), run.mask(line["frame"])):
                     _crop_file(place, crop_px)
-    film = options.film_of(name)
-    if film is not None and lines:
+    film = options.film_of(name) if lines else None
+    if options.crop and crop_px is None and film is not None:
+        raise OutputError("--crop: no frame was written that shows the video's area", hint="omit --crop")
+    if film is not None:
         rotation = display_matrix(movie)
         first_ns = lines[0]["timestamp_ns"]
         frames = _film_frames(run, lines, movie, index, crop_px, rotation if options.side_by_side else None, lens)
@@ -136,11 +141,11 @@ def finish_pictures(
     return Finished(crop_px, film, options.keep_frames)
 
 
-def common_rectangle(lines: Iterable[Json]) -> Crop:
-    """The rectangle with recorded data in every written frame.  Raises OutputError if there is none."""
+def common_rectangle(lines: Iterable[Json]) -> Crop | None:
+    """The rectangle with recorded data in every written frame, None without one.  Raises OutputError if it is empty."""
     inside = [line["valid_px"] for line in lines if line["output"] is not None]
     if not inside:
-        raise OutputError("--crop: no frame was written", hint="omit --crop")
+        return None
     x0, y0 = np.max([px[:2] for px in inside], axis=0).tolist()
     x1, y1 = np.min([px[2:] for px in inside], axis=0).tolist()
     if min(x1 - x0, y1 - y0) < LEAST_CROP_PX:

@@ -9,6 +9,7 @@ import math
 import os
 import secrets
 import unicodedata
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,30 @@ def _write_bytes(path: Path, data: bytes) -> None:
         file.write(data)
 
 
+def require_no_input(path: Path, inputs: Iterable[Path], option: str = "--out") -> None:
+    """Raise OutputError if the output would replace a file of the recording, whatever --overwrite allows."""
+    if (
+        not is_remote(path)
+        and path.is_file()
+        and any(not is_remote(f) and f.is_file() and path.samefile(f) for f in inputs)
+    ):
+        raise OutputError(f"{path}: belongs to the recording", hint=f"name another file by {option}")
+
+
+def require_writable(folder: Path, option: str = "--out") -> None:
+    """Raise OutputError, before any work, if a folder, or the nearest existing one above it, takes no files."""
+    if is_remote(folder):
+        return
+    place = next((place for place in (folder.absolute(), *folder.absolute().parents) if place.exists()), None)
+    if place is None:
+        return
+    hint = f"choose another folder with {option}"
+    if not place.is_dir():
+        raise OutputError(f"{folder}: {'is' if place == folder.absolute() else f'{place} is'} a file", hint=hint)
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise OutputError(f"{folder}: no permission to write in {place}, or the disk is read-only", hint=hint)
+
+
 def require_file(path: Path, *, overwrite: bool, option: str = "--out") -> None:
     """Raise OutputError, before any work, if a file could not be written there; option: the one that chose it."""
     if path.is_dir():
@@ -77,6 +102,7 @@ def require_file(path: Path, *, overwrite: bool, option: str = "--out") -> None:
         raise OutputError(f"{path}: its folder does not exist", hint=f"create it, or choose another path by {option}")
     if (path.exists() or path.is_symlink()) and not overwrite:
         raise OutputError(f"{path}: exists already", hint=f"name another by {option}, or pass --overwrite")
+    require_writable(path.absolute().parent, option)
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from virest.app import api
-from virest.app.outputs import require_file, write_whole
+from virest.app.outputs import require_file, require_no_input, write_whole
 from virest.arrays import Array
 from virest.capture.folder import Frame
 from virest.errors import CaptureError
@@ -39,6 +39,7 @@ def run_preview(path: str, options: PreviewOptions) -> tuple[Json, str]:
     """Restore one frame and write the picture; returns the mapping for ``--json`` and the printed text."""
     capture = api.open(path, options.config)
     out = options.out or Path(f"{capture.name}-preview.png")
+    require_no_input(out, capture.record.inputs)
     require_file(out, overwrite=options.overwrite)
     number = most_blurred(capture) if options.frame is None else options.frame
     restored = capture.restore(number, options.preset)

@@ -17,7 +17,7 @@ from virest.app.finish import Finished, finish_pictures, require_finishable
 from virest.app.jobs import PrefetchedCalls, Workers, run_segments
 from virest.app.names import shard_of
 from virest.app.outcome import CaptureOutcome, summary
-from virest.app.outputs import output_error
+from virest.app.outputs import output_error, require_writable
 from virest.app.planning import (
     Job,
     Planned,
@@ -137,6 +137,7 @@ def _process(slot: CaptureSlot, options: ProcessOptions, workers: Workers) -> Ca
     planned = Planned()
     try:
         require_startable(slot.path, slot.name, options)
+        require_writable(options.out / slot.name)
         with console.progress_bar(None, f"{shown(slot.name)}: reading and planning", quiet=options.quiet):
             planned = slot.plan(options)
         seconds = planned.seconds if slot.ahead else time.perf_counter() - began
@@ -165,7 +166,7 @@ def _process_planned(
     if planned.index is None or planned.plan is None or (found == "finished" and options.mode == "resume"):
         with opened_run(run, job.request, "resume"):
             return _repeat_finished(job, options)
-    require_finishable(options.finish, slot.name, run.path, overwrite=options.mode != "new")
+    require_finishable(options.finish, slot.name, run.path, job.inputs, overwrite=options.mode != "new")
     with opened_run(run, job.request, options.mode):
         try:
             if options.pictures.masks:

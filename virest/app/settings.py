@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
@@ -11,7 +12,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from virest.camera.yaml_mapping import explain_validation, load_yaml_mapping
 from virest.errors import SettingsError
-from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS, RestorationSettings
+from virest.restoration.settings import (
+    DEBLUR_METHODS,
+    MOST_NEIGHBOURS,
+    PRESETS,
+    REFERENCES,
+    SHUTTER_METHODS,
+    RestorationSettings,
+)
 
 _CHOICES: dict[str, tuple[str, ...]] = {
     "preset": tuple(PRESETS),
@@ -21,7 +29,10 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 }
 _RANGES: dict[str, dict[str, float]] = {
     "iterations": {"ge": 1, "le": 1000},
+    "joined_iterations": {"ge": 1, "le": 1000},
     "inner_iterations": {"ge": 1, "le": 1000},
+    "neighbours": {"ge": 0, "le": MOST_NEIGHBOURS},
+    "most_joined": {"ge": 0, "le": 2 * MOST_NEIGHBOURS},
     "tile_px": {"ge": 32, "le": 1024},
     "strength": {"gt": 0, "le": 1000},
     "min_blur_px": {"ge": 0, "le": 1000},
@@ -50,13 +61,18 @@ def settings_model() -> type[BaseModel]:
 
 def read_settings(path: Path) -> dict[str, Any]:
     """The keys that a settings file sets. Raises SettingsError with the file, the key, and the nearest known key."""
+    return checked_settings(load_yaml_mapping(path), path.name)
+
+
+def checked_settings(content: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The keys that are set, within their ranges; ``name`` is used in messages.  Raises SettingsError."""
     model = settings_model()
     try:
-        content = model.model_validate(load_yaml_mapping(path))
+        checked = model.model_validate(dict(content))
     except ValidationError as error:
-        raise explain_validation(error, model, path.name) from None
-    chosen = content.model_dump(exclude={"virest_settings"}, exclude_unset=True)
-    return {name: value for name, value in chosen.items() if value is not None}
+        raise explain_validation(error, model, name) from None
+    chosen = checked.model_dump(exclude={"virest_settings"}, exclude_unset=True)
+    return {key: value for key, value in chosen.items() if value is not None}
 
 
 def compose_settings(file: Path | None, **options: Any) -> RestorationSettings:
@@ -64,7 +80,7 @@ def compose_settings(file: Path | None, **options: Any) -> RestorationSettings:
     content = read_settings(file) if file else {}
     chosen = {name: value for name, value in options.items() if value is not None}
     if "neighbours" in chosen:
-        chosen["most_joined"] = 2 * chosen["neighbours"]
+        chosen.setdefault("most_joined", 2 * chosen["neighbours"])
     preset = chosen.get("preset") or content.get("preset") or "balanced"
     if preset not in PRESETS:
         raise SettingsError(f"preset '{preset}' is unknown", hint=f"choose from {', '.join(PRESETS)}")

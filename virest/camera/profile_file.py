@@ -20,6 +20,9 @@ from virest.camera.shutter import Shutter
 from virest.camera.yaml_mapping import explain_validation, load_yaml_mapping
 from virest.errors import SettingsError
 
+MOST_FOCAL_LENGTHS = 100
+"""Largest distance of a pixel from the principal point: 89.4° from the axis."""
+
 
 def read_profile(path: Path) -> CameraProfile:
     """Read a profile file. Raises SettingsError with the file, the key, and the nearest known key."""
@@ -137,16 +140,23 @@ def _lens(model: ProfileFile, fx_px: float, fy_px: float) -> Intrinsics:
     lens, width, height = model.intrinsics, model.image.width, model.image.height
     distortion = lens.distortion
     kind = "none" if distortion in (None, "none") else distortion.model  # type: ignore[union-attr]
-    return Intrinsics(
-        width,
-        height,
-        fx_px,
-        fy_px,
-        (width - 1) / 2 if lens.cx_px is None else lens.cx_px,
-        (height - 1) / 2 if lens.cy_px is None else lens.cy_px,
-        kind,
-        tuple(getattr(distortion, name) for name in COEFFICIENT_NAMES[kind]),
-    )
+    cx_px = (width - 1) / 2 if lens.cx_px is None else lens.cx_px
+    cy_px = (height - 1) / 2 if lens.cy_px is None else lens.cy_px
+    _require_angles((width, height), (fx_px, fy_px), (cx_px, cy_px))
+    coefficients = tuple(getattr(distortion, name) for name in COEFFICIENT_NAMES[kind])
+    return Intrinsics(width, height, fx_px, fy_px, cx_px, cy_px, kind, coefficients)
+
+
+def _require_angles(size: tuple[int, int], focal_px: tuple[float, float], centre_px: tuple[float, float]) -> None:
+    """Refuse a picture that the lens sees at impossible angles: blur paths there have millions of pixels."""
+    for axis, side, focal, centre in zip("xy", size, focal_px, centre_px, strict=True):
+        far = max(abs(centre), abs(side - 1 - centre))
+        if far > MOST_FOCAL_LENGTHS * focal:
+            raise SettingsError(
+                f"intrinsics: with f{axis}_px {focal:g} and c{axis}_px {centre:g}, the picture of {side} px reaches "
+                f"{far / focal:.4g} focal lengths from the principal point, at most {MOST_FOCAL_LENGTHS} are possible",
+                hint="is a decimal point missing? see docs/profile.md",
+            )
 
 
 def _response(block: ResponseBlock | None, extensions: ExtensionsBlock) -> ResponseCurve | None:

@@ -203,7 +203,8 @@ def parse_sensor(
         raise CaptureError(f"{name}: resolution must be width and height", hint="repair it, or give camera.yaml")
     shutter: dict[str, Any] = {"readout_direction": content.get("readout_direction", "top_to_bottom")}
     if content.get("line_delay_nanoseconds") is not None:
-        shutter["readout_time_s"] = _number(content["line_delay_nanoseconds"], name) * 1e-9 * movie.height
+        lines = movie.width if shutter["readout_direction"] in ("left_to_right", "right_to_left") else movie.height
+        shutter["readout_time_s"] = _number(content["line_delay_nanoseconds"], name) * 1e-9 * lines
     elif content.get("readout_time_s") is not None:
         shutter["readout_time_s"] = content["readout_time_s"]
     cam_imu = _inverse(pose) @ _inverse(imu_from_body)

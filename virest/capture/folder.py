@@ -6,7 +6,7 @@ time, and everything skipped is counted and explained.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -57,6 +57,8 @@ __all__ = [
 
 GUESSED_FOCAL = 0.8
 """Of the long side, as phones have: enough to decide whether the picture moves by more than half a pixel."""
+MOST_UNIX_LAG_S = 60.0
+"""A larger difference of the two Unix columns is a damaged number, such as the cut last one of a file."""
 MOST_LISTED = 12
 """Frames that a note lists; ``virest inspect --json`` has them all."""
 LARGE_RATE_RAD_S = 35.0
@@ -242,8 +244,9 @@ def _unix_lag_s(files: Source, alignment: Alignment, joined: NDArray[np.int64]) 
     if out_ns is None or in_ns is None:
         return None
     left, right = out_ns[alignment.rows], in_ns[joined]
-    known = (alignment.rows >= 0) & (joined >= 0) & (left > 0) & (right > 0)
-    return np.where(known, (left - right) / 1e9, np.nan)
+    lag_s = (left - right) / 1e9
+    known = (alignment.rows >= 0) & (joined >= 0) & (left > 0) & (right > 0) & (np.abs(lag_s) <= MOST_UNIX_LAG_S)
+    return np.where(known, lag_s, np.nan)
 
 
 # ── start-up, frames, report ─────────────────────────────────────────────────────────────────────────────────────
@@ -449,12 +452,12 @@ def _counts(files: Source, joined: _Joined, frames: tuple[Frame, ...]) -> dict[s
     }
     for code in sorted({code for frame in frames for code in frame.skip_codes}):
         counts[f"frames_skipped: {code}"] = sum(code in frame.skip_codes for frame in frames)
-    tables: Mapping[str, StampTable | MetadataTable | GyroTable | None] = {
-        files.names.stamps: files.stamps,
-        files.names.metadata: files.metadata,
-        files.names.gyro: files.gyro,
-    }
-    for name, table in tables.items():
+    tables: tuple[tuple[str, StampTable | MetadataTable | GyroTable | None], ...] = (
+        (files.names.stamps, files.stamps),
+        (files.names.metadata, files.metadata),  # of some recorders the same file
+        (files.names.gyro, files.gyro),
+    )
+    for name, table in tables:
         for reason, number in (table.dropped if table else {}).items():
             counts[f"{name} dropped: {reason}"] = number
     return counts

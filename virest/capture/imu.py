@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from virest.arrays import Array
+from virest.errors import ImuError
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,3 +34,20 @@ class ImuSamples:
         first = max(int(np.searchsorted(self.time_s, start_s)) - margin_samples, 0)
         last = min(int(np.searchsorted(self.time_s, end_s)) + margin_samples, len(self.time_s))
         return ImuSamples(self.time_s[first:last], self.gyro_rad_s[first:last], self.accel_m_s2[first:last])
+
+
+def checked_samples(imu: ImuSamples) -> ImuSamples:
+    """Samples built by hand, as arrays of numbers.  Raises ImuError for wrong shapes, gaps in the numbers or times."""
+    time_s, gyro, accel = (np.asarray(part, float) for part in (imu.time_s, imu.gyro_rad_s, imu.accel_m_s2))
+    count = time_s.size
+    if (time_s.shape, gyro.shape, accel.shape) != ((count,), (count, 3), (count, 3)):
+        raise ImuError(
+            f"inertial samples of shapes {time_s.shape}, {gyro.shape}, {accel.shape}",
+            hint="time_s is (n,), gyro_rad_s and accel_m_s2 are (n, 3)",
+        )
+    if not (np.isfinite(time_s).all() and np.isfinite(gyro).all()):
+        raise ImuError("times or rates of the inertial samples are not finite", hint="leave those rows out")
+    if (np.diff(time_s) <= 0).any():
+        at = int(np.argmax(np.diff(time_s) <= 0)) + 1
+        raise ImuError(f"times of the inertial samples do not rise at row {at}", hint="sort them, each time once")
+    return ImuSamples(time_s, gyro, accel)

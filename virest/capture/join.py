@@ -132,14 +132,16 @@ def _best_offsets(pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float) -> tuple
 def _misfit(pts_ns: Int64, stamps_ns: Int64, tolerance_ns: float, matched: int, what: str) -> ClockError:
     common = min(len(pts_ns), len(stamps_ns))
     text = f"movie has {len(pts_ns)} frames, {what} {len(stamps_ns)} rows; no shift matches more than {matched} of them"
-    if common > 1:
-        difference = np.abs(stamps_ns[:common] - stamps_ns[0] - pts_ns[:common])
+    difference = np.abs(stamps_ns[:common] - stamps_ns[:1] - pts_ns[:common])
+    if (difference > tolerance_ns).any():
         first = int(np.argmax(difference > tolerance_ns))
         text += (
             f"; PTS and {what} first differ at frame {first}, by {difference[first] / 1e3:.1f} µs"
             f" (tolerance {tolerance_ns / 1e3:.1f} µs), at most by {difference.max() / 1e6:.3f} ms"
         )
     hint = "movie and timestamps come from different recordings, or the movie was re-encoded"
+    if 1 < matched == len(stamps_ns):
+        hint = f"{what} lacks most of its rows: copy it again"
     return ClockError(text, hint=hint, matched=matched)
 
 

@@ -30,6 +30,7 @@ from virest.capture.tables import (
     Int64,
     MetadataTable,
     StampTable,
+    cut_field,
     keep_rising,
     make_gyro_table,
     make_metadata_table,
@@ -254,7 +255,12 @@ def read_movie_metadata(path: Path) -> MetadataTable:
     time_ns = np.concatenate(times)
     rows = _count_rows(time_ns, dropped)
     keep = _keep_times(time_ns, path, dropped)
-    found = {name: np.concatenate(parts)[keep] for name, parts in values.items()}
+    found = {name: np.concatenate(parts) for name, parts in values.items()}
+    cut = None if scan.ends_with_newline else cut_field(path)
+    for name, place in places.items():
+        if len(time_ns) and place is not None and place == cut:
+            found[name][-1] = np.nan  # a part of a number may still parse
+    found = {name: column[keep] for name, column in found.items()}
     for name in ("exposure_s", "readout_time_s"):
         found[name] = found[name] * 1e-9
     unix_ns = None if unix_place is None else np.concatenate(unix)[keep]

@@ -177,7 +177,9 @@ def _read_arkit_frames(path: Path, movie: MovieIndex) -> tuple[Rows, _Lens]:
     rows = read_rows(path, places, times=_seconds, error=CaptureError)
     if not len(rows.time_ns):
         raise CaptureError(f"{label(path)}: has no rows", hint="the recording was not stopped, or the copy was cut")
-    fx, fy, cx_a, cx_b, cy_a, cy_b, width, height = rows.values.T
+    *lens_px, width, height = rows.values.T
+    fx, fy, cx_a, cx_b, cy_a, cy_b = lens_px
+    width, height = (np.where(side > 0, side, np.nan) for side in (width, height))
     # K's last column in either index order of the header: the other entries are zero
     cx, cy = np.where(np.abs(cx_a) > np.abs(cx_b), cx_a, cx_b), np.where(np.abs(cy_a) > np.abs(cy_b), cy_a, cy_b)
     scale_x, scale_y = movie.width / width, movie.height / height
@@ -231,11 +233,12 @@ def _refined(rows_ns: Int64, stamps_ns: Int64, grid_ns: float) -> Int64:
 def _profile(movie: MovieIndex, lens: _Lens, device: str) -> CameraProfile:
     """A phone's axes, and the logged intrinsics if the picture is stored as the sensor reads it."""
     profile = phone_profile(movie.width, movie.height, device)
-    known = np.isfinite(lens.fx_px) & np.isfinite(lens.cx_px)
+    known = np.isfinite([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px]).all(axis=0)
     if not known.any() or movie.height > movie.width:
         return profile
     fx, fy, cx, cy = (float(np.median(c[known])) for c in (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px))
-    plausible = 0.4 <= fx / movie.width <= 1.6 and 0 < cx < movie.width and 0 < cy < movie.height
+    plausible = 0.4 <= fx / movie.width <= 1.6 and 0.5 * fx <= fy <= 2.0 * fx
+    plausible = plausible and 0 < cx < movie.width and 0 < cy < movie.height
     if not plausible:
         return profile
     optics = Intrinsics(movie.width, movie.height, fx, fy, cx, cy)

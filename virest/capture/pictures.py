@@ -109,7 +109,8 @@ def _rising(path: Path, time_ns: Int64, names: list[str], rows: int, dropped: Co
 
 def _list_rows(path: Path, head: str) -> tuple[Int64, list[str], int, Counter[str]] | None:
     """(times, names, rows, dropped) of a list; None if its rows have no names. Raises VideoError, ClockError."""
-    lines = [line.strip() for line in head.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    lines = [line.strip() for line in head.replace('"', "").splitlines()]
+    lines = [line for line in lines if line and not line.startswith("#")]
     separator = "," if any("," in line for line in lines[:2]) else r"\s+"
     row = next((re.split(separator, line) for line in lines if re.match(r"[+-]?\d", line)), [])
     fields = [field.strip().lower() for field in row]

@@ -143,10 +143,15 @@ def resolve_profile(capture: Capture, config: Path | None = None) -> tuple[Camer
     if path is None:
         return with_logged_focal(default_profile(capture), capture), "the capture's metadata and documented defaults"
     profile = read_any_profile(locate(path))
+    require_size(profile, capture, locate(path).name)
+    return with_logged_focal(for_capture(fill_from_metadata(profile, capture), capture), capture), str(path)
+
+
+def require_size(profile: CameraProfile, capture: Capture, name: str) -> None:
+    """Raise SettingsError if the profile's picture size is not the movie's; ``name`` is the profile's in messages."""
     if (profile.width, profile.height) != (capture.width, capture.height):
         raise SettingsError(
-            f"{locate(path).name}: image {profile.width}x{profile.height}, but {capture.name}/{capture.movie.name} is "
+            f"{name}: image {profile.width}x{profile.height}, but {capture.name}/{capture.movie.name} is "
             f"{capture.width}x{capture.height}",
             hint="a profile applies to one stored size; scale its intrinsics, or pass the profile of this mode",
         )
-    return with_logged_focal(for_capture(fill_from_metadata(profile, capture), capture), capture), str(path)

@@ -12,6 +12,8 @@ PLAUSIBLE_FOCAL = (0.55, 1.1)
 """fx over the long side of a phone's main camera."""
 BEARABLE_FOCAL = (0.4, 1.6)
 """Outside, fx is not in pixels of the movie but of the sensor's active array."""
+PLAUSIBLE_ASPECT = (0.5, 2.0)
+"""fy over fx: 1 for square pixels, up to 16:9 for stretched movies."""
 
 
 def summarise(files: Source, notes: list[Note]) -> CaptureMetadata:
@@ -29,13 +31,19 @@ def summarise(files: Source, notes: list[Note]) -> CaptureMetadata:
         fx, fy = lens.fx_px, lens.fy_px
     elif not _focal_plausible(fx, files.movie.width, files.movie.height, name, notes):
         fx = fy = None
+    elif fx and fy and not PLAUSIBLE_ASPECT[0] <= fy / fx <= PLAUSIBLE_ASPECT[1]:
+        notes.append(Note("warning", "fy-implausible", f"{name}: fy {fy:.4g} px beside fx {fx:.4g} px is ignored"))
+        fy = None
     elif files.movie.height > files.movie.width:
         fx, fy = fy, fx
     logged_s = _median(table.readout_time_s)
     if logged_s is None and readout_s is None:
         notes.append(Note("info", "readout-unknown", f"{name} has no readout time"))
     if _median(table.exposure_s) is None:
-        notes.append(Note("warning", "exposure-unknown", f"{name} has no exposure times: no deblurring"))
+        why = "has no exposure times"
+        if table.odd_exposure_s is not None:
+            why = f"has exposure times such as {table.odd_exposure_s:.3g} s (are they in the header's unit?)"
+        notes.append(Note("warning", "exposure-unknown", f"{name} {why}: no deblurring"))
     return CaptureMetadata(
         fx_px=fx,
         fy_px=fy,

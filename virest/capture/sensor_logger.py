@@ -70,7 +70,7 @@ def read_sensor_logger(folder: Path, notes: list[Note]) -> Source:
 def columns_of(path: Path) -> tuple[str, ...]:
     """Names in a CSV file's first line, in lower case.  Raises ImuError if it is not text."""
     head = scan_text(path, ImuError, HINT).head.lstrip("\ufeff").splitlines()
-    return tuple(name.strip().lower() for name in head[0].split(",")) if head else ()
+    return tuple(name.strip().strip('"').lower() for name in head[0].split(",")) if head else ()
 
 
 def named_start_ns(movie: Path) -> int | None:
@@ -86,7 +86,7 @@ def _read_sensor(path: Path) -> Rows:
     columns = columns_of(path)
     missing = [axis for axis in AXES if axis not in columns]
     if missing or columns[:1] != ("time",):
-        text = f"{label(path)}: columns are {', '.join(columns)[:80]}"
+        text = f"{label(path)}: columns are {', '.join(columns)[:80] or 'none'}"
         raise ImuError(text, hint="expected time, seconds_elapsed, z, y, x")
     return read_rows(path, [columns.index(axis) for axis in AXES], required=3, hint=HINT)
 
@@ -111,5 +111,5 @@ def _is_ios(folder: Path) -> bool:
     lines = scan_text(path, ImuError, HINT).head.lstrip("\ufeff").splitlines()
     if len(lines) < 2:
         return False
-    entries = dict(zip((name.strip().lower() for name in lines[0].split(",")), lines[1].split(","), strict=False))
-    return entries.get("platform", "").strip().lower() == "ios"
+    names, values = ([field.strip().strip('"').lower() for field in line.split(",")] for line in lines[:2])
+    return dict(zip(names, values, strict=False)).get("platform") == "ios"

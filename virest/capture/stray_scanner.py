@@ -79,9 +79,11 @@ def _with_matrix(profile: CameraProfile, path: Path, movie: MovieIndex) -> Camer
     except ValueError:
         raise CaptureError(f"{label(path)}: is not a 3 x 3 matrix", hint=HINT) from None
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    if not (0.3 <= fx / movie.width <= 3.0 and 0 < cx < movie.width and 0 < cy < movie.height):
+    plausible = 0.3 <= fx / movie.width <= 3.0 and 0.5 * fx <= fy <= 2.0 * fx
+    if not (plausible and 0 < cx < movie.width and 0 < cy < movie.height):
         raise CaptureError(
-            f"{label(path)}: fx {fx:.4g}, cx {cx:.4g}, cy {cy:.4g} do not fit a {movie.width}x{movie.height} picture",
+            f"{label(path)}: fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g} "
+            f"do not fit a {movie.width}x{movie.height} picture",
             hint="give a camera.yaml",
         )
     lens = Intrinsics(movie.width, movie.height, float(fx), float(fy), float(cx), float(cy))

@@ -27,10 +27,15 @@ if TYPE_CHECKING:
 ROWS_AT_ONCE = 100_000
 """Rows read at a time.  Reading a log of 300 000 rows then takes 110 MB; with half or twice as many 80 or
 164 MB, in the same time to 10 %."""
+QUOTES_SEEN = 8
+"""Rows of a chunk that show whether its fields are quoted."""
 MAX_FIELDS, MANY_FIELDS = 16, 64
 """Most columns of a log, which has up to 12, and of a table of another app."""
 MAX_RATE_RAD_S = 200.0
 """The full scale of phone gyroscopes is 35 rad/s (2000 °/s); a row above this limit is damaged."""
+
+EQUAL, FALLS = "time equals its predecessor's", "time falls or leaps"
+"""Reasons for dropping a row."""
 
 Int64 = NDArray[np.int64]
 Float64 = Array
@@ -38,7 +43,10 @@ Float64 = Array
 INTEGER = re.compile(r"[+-]?(?:\d{1,18}|[0-8]\d{18}|9[01]\d{17})")
 """An integer that fits in 64 bits; Unix nanoseconds have 19 digits."""
 DAMAGED_TIME = r"[+-]?(?:\d+[.,]\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)"
+SPOILT_TIME = r"[+-]?(?:\d+(?:[.,]\d*)?[eE][+-]?\d+|\d{14,}\.\d*)"
+"""A number of nanoseconds that went through a float; seconds have at most ten digits before the point."""
 EXCEL_HINT = "a spreadsheet has re-saved the file and lost the nanoseconds; copy the original from the phone again"
+ORDER_HINT = "the rows are out of order, or were written twice; sort them by time, or copy the original again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +82,8 @@ class MetadataTable:
     """(n,) time of the capture result, 0 if unreadable; None: no such column."""
     rows: int
     dropped: dict[str, int] = field(default_factory=dict)
+    odd_exposure_s: float | None = None
+    """The first logged exposure that no camera has, such as one in other units; None: there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,11 +141,18 @@ def text_chunks(path: Path, separator: str = ",", fields: int = MAX_FIELDS) -> I
         try:
             with pd.read_csv(path, **options) as reader:
                 for chunk in reader:
-                    yield chunk.fillna("")
+                    yield _unquoted(chunk.fillna(""))
         except pd.errors.EmptyDataError:
             return
         except (pd.errors.ParserError, OSError) as fault:
             raise CaptureError(f"{label(path)}: {one_line(fault)}", hint="copy the logger's file again") from None
+
+
+def _unquoted(chunk: pd.DataFrame) -> pd.DataFrame:
+    """The fields without the quotes that R, csv writers and spreadsheets put around them."""
+    if not any('"' in field for field in chunk.head(QUOTES_SEEN).to_numpy().ravel()):
+        return chunk
+    return chunk.apply(lambda column: column.str.strip().str.strip('"'))
 
 
 def numbers(column: Any) -> Float64:
@@ -174,7 +191,7 @@ def strictly_rising(times: Int64) -> tuple[Mask, dict[str, int]]:
         if longest.sum() > rising.sum():
             rising = longest
     keep[rows] = rising
-    counts = {"time equals its predecessor's": equal, "time falls or leaps": int((~rising).sum())}
+    counts = {EQUAL: equal, FALLS: int((~rising).sum())}
     return keep, {reason: count for reason, count in counts.items() if count}
 
 
@@ -207,7 +224,7 @@ def keep_rising(times: Int64, path: Path, dropped: Counter[str]) -> Mask:
         raise ClockError(
             f"{label(path)}: only {int(keep.sum())} of {len(times)} times rise "
             f"({', '.join(f'{n} {reason}' for reason, n in lost.items())})",
-            hint=EXCEL_HINT,
+            hint=EXCEL_HINT if lost.get(EQUAL, 0) > lost.get(FALLS, 0) else ORDER_HINT,
         )
     dropped.update(lost)
     return keep
@@ -234,10 +251,10 @@ class Rows:
 def exact_times_ns(text: Any, path: Path, *, whole_are_seconds: bool = False) -> tuple[Int64, Mask]:
     """Integer nanoseconds of times written as such or as decimal seconds, truncated below 1 ns.
 
-    Raises ClockError for exponents, which a spreadsheet writes after it has lost the nanoseconds.
+    Raises ClockError for exponents and for fractions of nanoseconds, which are written once the digits are lost.
     """
     text = text.str.strip()
-    spoilt = text.str.fullmatch(r"[+-]?\d+(?:[.,]\d*)?[eE][+-]?\d+").to_numpy()
+    spoilt = text.str.fullmatch(SPOILT_TIME).to_numpy()
     if spoilt.any():
         raise ClockError(f"{label(path)}: time '{text[spoilt].iloc[0][:40]}' has lost its digits", hint=EXCEL_HINT)
     whole = text.str.fullmatch(INTEGER).to_numpy()
@@ -299,20 +316,27 @@ def read_rows(
     time_ns, values = np.concatenate(found_ns), np.concatenate(found)
     rows = len(time_ns) + sum(dropped.values())
     keep = keep_rising(time_ns, path, dropped)
-    if last_is_good and not scan.ends_with_newline and len(keep) > 1 and keep[-1] and _looks_cut(path, separator):
+    unended = last_is_good and not scan.ends_with_newline and len(keep) > 1
+    if unended and keep[-1] and cut_field(path, separator) is not None:
         keep[-1] = False  # a truncated last number may still parse
         dropped["last line without its end"] += 1
     return Rows(time_ns[keep], values[keep], rows, dict(+dropped))
 
 
-def _looks_cut(path: Path, separator: str) -> bool:
-    """Whether the last line has fewer fields, or a shorter last field, than the line before: a truncated file."""
+def cut_field(path: Path, separator: str = ",") -> int | None:
+    """Place of the last field of a file that lacks its last line end, if it looks truncated there; else None.
+
+    Truncated: the last line has fewer fields, or a shorter last field, than the line before.
+    """
     with path.open("rb") as stream:
         stream.seek(max(path.stat().st_size - 4096, 0))
         lines = stream.read().decode("utf-8", errors="replace").splitlines()
+    if len(lines) < 2:
+        return None
     split = re.compile(r"\s+" if separator != "," else ",")
-    last, before = (split.split(line.strip()) for line in (lines[-1], lines[-2])) if len(lines) > 1 else ([], [])
-    return len(last) != len(before) or len(last[-1]) < len(before[-1])
+    last, before = (split.split(line.strip()) for line in (lines[-1], lines[-2]))
+    whole = len(last) == len(before) and len(last[-1]) >= len(before[-1])
+    return None if whole else len(last) - 1
 
 
 def make_gyro_table(
@@ -353,4 +377,7 @@ def make_metadata_table(
     for name, (low, high) in PLAUSIBLE.items():
         given = columns.get(name, np.full(len(time_ns), np.nan))
         values[name] = np.where((given >= low) & (given <= high), given, np.nan)
-    return MetadataTable(time_ns, **values, unix_ns=unix_ns, rows=rows, dropped=dropped)
+    logged = columns.get("exposure_s", np.zeros(0))
+    odd = logged[(logged > 0) & ~np.isfinite(values["exposure_s"])] if len(logged) else logged
+    odd_s = float(odd[0]) if len(odd) else None
+    return MetadataTable(time_ns, **values, unix_ns=unix_ns, rows=rows, dropped=dropped, odd_exposure_s=odd_s)

@@ -148,6 +148,8 @@ def _missing_movie_hint(path: Path) -> str:
     try:
         if isinstance(path, RemotePath) or path.exists():
             return needs
+        if path.is_symlink():
+            return "it is a link to a file that is not there; put the movie itself in its place"
         others = sorted(file.name for file in path.parent.iterdir() if file.suffix.lower() in MOVIE_SUFFIXES)
     except (OSError, ValueError):
         return needs

@@ -63,7 +63,7 @@ def path_of_kernel(kernel: Array) -> tuple[Array, Array]:
     Raises SettingsError unless the kernel is 2-D, finite and non-negative, with a positive sum.
     """
     kernel = np.asarray(kernel, float)
-    if kernel.ndim != 2 or not np.isfinite(kernel).all() or kernel.min() < 0 or not kernel.sum() > 0:
+    if kernel.ndim != 2 or not kernel.size or not np.isfinite(kernel).all() or kernel.min() < 0 or not kernel.sum() > 0:
         raise SettingsError(
             "a kernel is a two-dimensional array of finite values, none below 0, with a positive sum",
             hint="pass kernel=, or path_px= for a blur path",
@@ -91,7 +91,8 @@ def even_path(path_px: Array) -> Array:
 def as_colour(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """An 8-bit picture (h, w) or (h, w, 3) as RGB; raises SettingsError for anything else."""
     picture = np.asarray(picture)
-    if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or (picture.ndim == 3 and picture.shape[2] != 3):
+    shaped = picture.size and (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3))
+    if picture.dtype != np.uint8 or not shaped:
         raise SettingsError(
             f"a picture is an array of uint8, (height, width) or (height, width, 3) RGB, not {picture.dtype} "
             f"{picture.shape}",

@@ -17,6 +17,8 @@ JOINT_METHODS = ("gradient-wiener", "hyper-laplacian")
 """Methods that can restore a frame jointly with its neighbours."""
 SHUTTER_METHODS = ("none", "perspective", "rowwise")
 REFERENCES = ("exposure-start", "frame-middle")
+MOST_NEIGHBOURS = 8
+"""Frames on each side: farther away even a capture at 30 frames/s shows a different scene."""
 FEW_ITERATIONS = 2
 """At or below this iteration count, cheaper approximations are used elsewhere too."""
 

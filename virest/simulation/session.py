@@ -41,6 +41,8 @@ DEFAULT_SWAY_M = 0.012
 LONGEST_EXPOSURE_S, LONGEST_OFFSET_S, FASTEST_HAND_RAD_S = 10.0, 600.0, 100.0
 """Limits of the renderer: 300 frame periods at 30 frames/s; 120 000 more inertial samples at 200 Hz; three times the
 full scale of phone gyroscopes (35 rad/s)."""
+FASTEST_OBJECT_PX_S = 2e4
+"""Limit of the renderer: a car at 20 m/s, 1 m in front of a phone."""
 NEAREST_M, FARTHEST_M = 0.001, 1e6
 """Limits of the renderer, far beyond any phone's recording."""
 FOCAL_OF_LONG_SIDE = (0.05, 100.0)
@@ -322,9 +324,9 @@ def _require_sizes(profile: CameraProfile, settings: SessionSettings) -> None:
         refuse("the exposure is not positive", "use about 1 to 20 ms")
     if not max(settings.exposure_s) <= LONGEST_EXPOSURE_S:
         refuse(f"an exposure of {max(settings.exposure_s):g} s", f"at most {LONGEST_EXPOSURE_S:g} s are rendered")
-    if settings.moving_px_s < 0:
-        refuse(f"objects that move at {settings.moving_px_s:g} px/s", "use 0 or more")
-    if abs(settings.pan_rad_s) > FASTEST_HAND_RAD_S:
+    if not 0 <= settings.moving_px_s <= FASTEST_OBJECT_PX_S:
+        refuse(f"objects that move at {settings.moving_px_s:g} px/s", f"use 0 to {FASTEST_OBJECT_PX_S:g}")
+    if not abs(settings.pan_rad_s) <= FASTEST_HAND_RAD_S:
         refuse(f"a pan of {settings.pan_rad_s:g} rad/s", f"use -{FASTEST_HAND_RAD_S:g} to {FASTEST_HAND_RAD_S:g}")
     far = scene_depth_m(profile)
     if settings.near_m is not None and not NEAREST_M <= settings.near_m < far:

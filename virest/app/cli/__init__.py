@@ -39,6 +39,10 @@ _SYSTEM_HINTS = {
     errno.EDQUOT: "your disk quota is exhausted; free some space there",
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ELOOP: "the path contains a circular link; choose another",
+    errno.EROFS: "the disk is read-only; choose another folder",
+    errno.EACCES: "no permission there; choose another folder, or change its permissions",
+    errno.EPERM: "no permission there; choose another folder, or change its permissions",
+    errno.ENOTDIR: "part of this path is a file; choose another folder",
 }
 
 app = typer.Typer(
@@ -148,7 +152,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _file_system_error(error: Exception) -> OutputError | None:
-    """An operating-system error about a path that was not checked before: disk full, path too long, link loop."""
+    """An operating-system error about a path that was not checked before: disk full, no permission, path too long."""
     if not isinstance(error, OSError) or error.errno not in _SYSTEM_HINTS:
         return None
     return OutputError(f"{error.filename or 'output'}: {error.strerror}", hint=_SYSTEM_HINTS[error.errno])

@@ -13,13 +13,12 @@ import typer.core
 
 from virest import __version__
 from virest.app import console
+from virest.restoration.settings import MOST_NEIGHBOURS
 
 log = logging.getLogger(__name__)
 
 ARGUMENTS, OPTIONS = "Arguments", "Options"
 """Titles of a command's help without groups of its own."""
-MOST_NEIGHBOURS = 8
-"""Frames on each side: farther away even a capture at 30 frames/s shows a different scene."""
 
 
 def show_version(wanted: bool) -> None:

@@ -38,6 +38,8 @@ def preview(
     wrote text-preview.png
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
+    if out is not None and out.suffix.lower() != ".png":
+        raise typer.BadParameter(f"--out {out.name}: a PNG is written; the name must end in .png")
     prepare_process()
     from virest.app.preview import PreviewOptions, run_preview
 

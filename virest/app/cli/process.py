@@ -28,6 +28,8 @@ from virest.app.cli.options import (
 from virest.app.machine import cores, prepare_process
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, REFERENCES, SHUTTER_METHODS
 
+FILM_ENDINGS = (".mp4", ".m4v", ".mov")
+
 
 def process(
     captures: Captures,
@@ -132,6 +134,8 @@ def process(
     paths = capture_paths(captures)
     if not paths:
         return 0
+    if video is not None and not video.lower().endswith(FILM_ENDINGS):
+        raise typer.BadParameter(f"--video {video!r}: an MP4 is written; name it *{FILM_ENDINGS[0]}")
     if video is not None and len(paths) > 1 and "{capture}" not in video:
         raise typer.BadParameter("--video: several captures need {capture} in the file name")
     prepare_process()

@@ -48,6 +48,12 @@ def new(
     $ virest profile new --device "Honor View" --size 1280x720 --fov-deg 66
     """  # noqa: D301
     console.configure(quiet=quiet, verbose=verbose)
+    for one, other, both in (
+        ("CAPTURE", "--size", capture is not None and size is not None),
+        ("--focal-px", "--fov-deg", focal_px is not None and fov_deg is not None),
+    ):
+        if both:
+            raise typer.BadParameter(f"{one} and {other} state the same; give one of them")
     from virest.app.new_profile import NewProfile, parse_size, run_new_profile
 
     folder = None if capture is None else Path(console.folder_of(capture))
