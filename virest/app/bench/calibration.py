@@ -43,7 +43,7 @@ EXTRA = ("focal", "distortion", "principal-point")
 HIDDEN = ("time_offset", "readout_time", "gyro_bias", "imu_rotation", "focal_length", "radial_distortion",
           "principal_point")  # fmt: skip
 SCENES = ("leaves", "text", "board", "photographs")
-FIRST_SEED = 2001
+FIRST_SEED = 4001
 """First of this section's seeds."""
 SHARES, LEFTS = np.arange(0.0, 0.0151, 0.001), np.arange(0.0, 0.51, 0.05)
 """Shared fractions and parts of the blur's bias of which the most likely are sought."""
