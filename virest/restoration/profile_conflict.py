@@ -48,7 +48,7 @@ TOLD_SIGMA = 3.0
 MAX_CAUSES = 3
 """Of the four causes, two of which are twins.  Their rounds have 4 + 3 + 2 trials."""
 JUDGED = 2
-"""Number of causes tested on held-out blocks in each round, those that fit best."""
+"""Number of causes with plausible values tested on held-out blocks in each round, those that fit best."""
 BLOCKS = 8
 """Time blocks.  Student's t at HELD_OUT_P is then 1.89; with half as many blocks 2.35, with twice as many 1.75."""
 POINTS, START_POINTS, STARTS = 1500, 400, 2
@@ -209,20 +209,18 @@ class _Search:
         return "" if abs(change) > TOLD_SIGMA * std else f" (or a {twin.name}: this motion cannot tell them apart)"
 
     def _next(self, here: _Start, fit: TrackFit) -> tuple[_Start, TrackFit] | None:
-        """The first cause, by fit, that predicts held-out blocks significantly better and has a plausible value."""
+        """The cause with a plausible value that predicts held-out blocks best, if significantly better than none."""
         fitted = {term.name for term in (*self.nuisances, *(cause.term for cause in here.causes))}
         open_causes = [cause for cause in CAUSES if cause.term.name not in fitted]
-        fitted_causes = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
-        without = None
-        for start, found in sorted(fitted_causes, key=lambda one: one[1].cost)[:JUDGED]:
-            if found.cost >= fit.cost or found.scale >= fit.scale or not self._has_value(start, found):
-                continue
-            without = self._held_out(here, fit) if without is None else without
-            scale = min(fit.scale, found.scale)
-            gain = self._block_loss(without, scale) - self._block_loss(self._held_out(start, found), scale)
-            if chance_of(gain) < HELD_OUT_P:
-                return start, found
-        return None
+        tried = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
+        better = [one for one in tried if one[1].cost < fit.cost and one[1].scale < fit.scale and self._has_value(*one)]
+        judged = sorted(better, key=lambda one: one[1].cost)[:JUDGED]
+        if not judged:
+            return None
+        scale = min(found.scale for _, found in judged)
+        without, *each = (self._block_loss(self._held_out(*one), scale) for one in ((here, fit), *judged))
+        significant = [n for n, loss in enumerate(each) if chance_of(without - loss) < HELD_OUT_P]
+        return judged[min(significant, key=lambda n: float(each[n].mean()))] if significant else None
 
     def _best(self, here: _Start, fit: TrackFit, cause: Cause) -> tuple[_Start, TrackFit] | None:
         """The cause's best fit from its best starts, on the profile as it stood before the last fit and after it."""
