@@ -266,7 +266,7 @@ def test_a_link_to_no_movie_is_called_one(writer):
 
 
 def write_unix_columns(writer: CaptureWriter, lags_ms: list[int], cut: int = 0) -> None:
-    """Write times since 1970 to stamps and metadata; the encoder's are later by ``lags_ms``, ``cut`` bytes are missing."""
+    """Write times since 1970 to both files; the encoder's are later by ``lags_ms``, ``cut`` bytes are missing."""
     stamps = [
         f"{s // 1000 * 1000},{10**18 + s + lag * 10**6}" for s, lag in zip(writer.stamps_ns, lags_ms, strict=True)
     ]
