@@ -102,7 +102,7 @@ def test_frames_with_unknown_motion_are_left_out():
     assert known_frames([*frames, hole]) == tuple(frames)
 
 
-def test_a_re_creation_has_the_same_data_and_similar_pictures(lively, tmp_path):
+def test_a_recreated_capture_has_the_same_data_and_similar_pictures(lively, tmp_path):
     """Samples and timestamps are equal; pictures differ by a small part of the change by motion."""
     again = tmp_path / "again"
     facts = simulate_like(again, lively, noise_levels=0.5)
@@ -122,7 +122,7 @@ def test_a_re_creation_has_the_same_data_and_similar_pictures(lively, tmp_path):
     assert apart.max() < 0.6 * moved
 
 
-def test_an_effect_can_be_hidden_in_a_partial_re_creation(lively, tmp_path):
+def test_an_effect_can_be_hidden_in_a_partly_recreated_capture(lively, tmp_path):
     """Only the truth folder's profile has the effect, and the scene stays in front of the camera."""
     again = tmp_path / "again"
     facts = simulate_like(again, lively, frames=slice(2, 6), effects=["readout_time=0.009"], seed=5)
@@ -158,7 +158,7 @@ def test_a_view_beyond_the_scene_is_refused(simulate, tmp_path):
     assert not (tmp_path / "again").exists()
 
 
-def test_invalid_re_creations_are_refused(lively, tmp_path):
+def test_an_invalid_recreation_is_refused(lively, tmp_path):
     """The capture itself as output, steps between frames, and a range without frames are refused.
 
     A changed exposure scale in the profile is accepted.
@@ -176,7 +176,7 @@ def test_invalid_re_creations_are_refused(lively, tmp_path):
     assert facts["blur_px"] > 0
 
 
-def test_the_command_re_creates_a_capture(lively, tmp_path, capfd):
+def test_the_command_recreates_a_capture(lively, tmp_path, capfd):
     """``--like`` uses the capture's camera and times, and ``--frames A:B`` selects frames.
 
     Options that would be ignored end with 2, a folder without a capture with 4, and an unknown effect with 3.

@@ -77,8 +77,7 @@ def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> t
         return plan, dict(sights)
     usable = [(one.picture, one.motion) for one in sights.values() if one.usable and one.motion is not None]
     edges = overshoot(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
-    mask = None if edges is None else edges.expected_mask()
-    if edges is None or mask is None or mask.amount <= RESIDUAL_AMOUNT:
+    if edges is None or (mask := edges.expected_mask()).amount <= RESIDUAL_AMOUNT:
         return plan, dict(sights)
     seen = "edges overshoot as after" if edges.certain else "edges do not exclude"
     note = (
