@@ -533,7 +533,7 @@ def test_consistent_light_is_unchanged_even_below_zero() -> None:
     found = consistent_light(blurred, luma_of(channels), channels, channels, along, 2, 2)
     np.testing.assert_allclose(found, channels, atol=1e-4)
     luma = np.full((80, 120), -0.05, np.float32)
-    np.testing.assert_allclose(without_negative_light(blurred, luma, along, 2, 2), luma, atol=1e-4)
+    np.testing.assert_allclose(without_negative_light(blurred, luma, along, 2), luma, atol=1e-4)
 
 
 def test_waves_in_dark_areas_shrink_to_the_mean_light() -> None:
@@ -542,7 +542,7 @@ def test_waves_in_dark_areas_shrink_to_the_mean_light() -> None:
     light = np.full((80, 120), 0.02, np.float32)
     light[:, 60:] = 0.4 + 0.1 * np.sin(np.arange(60) * 2 * np.pi / 12)
     light[:, :48] += 0.2 * np.sin(np.arange(48) * 2 * np.pi / 12)
-    found = without_negative_light(blurred, light, blur_along_paths(blurred, 2), 2, 2)
+    found = without_negative_light(blurred, light, blur_along_paths(blurred, 2), 2)
     assert found.min() >= 0
     waves = found[:, 12:36]
     assert abs(waves.mean() - 0.02) < 0.005, "0.07 if negative light is only clipped"

@@ -57,11 +57,11 @@ def with_colour(blurred: BlurredPicture, sharp: Image, settings: RestorationSett
     """
     height, width = blurred.light[0].shape
     few = settings.iterations <= FEW_ITERATIONS
-    scale = COARSE_COLOUR_SCALE if few and blurred.longest_px > COARSE_COLOUR_BLUR_PX else COLOUR_SCALE
-    steps = 1 if few else LIGHT_STEPS
-    along = blur_along_paths(blurred, scale) if blurred.longest_px >= scale else None
+    coarsest = COARSE_COLOUR_SCALE if blurred.longest_px > COARSE_COLOUR_BLUR_PX else COLOUR_SCALE
+    scale, steps = (coarsest, 1) if few else (COLOUR_SCALE, LIGHT_STEPS)
+    along = blur_along_paths(blurred, coarsest) if blurred.longest_px >= coarsest else None
     if along is not None:
-        sharp = without_negative_light(blurred, sharp, along, scale, steps)
+        sharp = without_negative_light(blurred, sharp, along, steps)
     small, recorded = shrunk(sharp, blurred, scale), _small_differences(blurred, scale)
     red_blue = _sharp_differences(blurred, recorded, small, settings, scale)
     seen, light = (

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -18,8 +19,6 @@ from virest.image_formation.blur import Image
 from virest.restoration.blurred import BlurredPicture, block_means, luma_of
 from virest.restoration.tile_layout import sampled_kernels
 
-PathBlur = tuple[Callable[[Image], Image], Callable[[Image], Image]]
-"""A blur and its transpose."""
 LIGHT_STEPS = 2
 """Number of steps.
 
@@ -29,21 +28,27 @@ LEAST_LIGHT = 1e-6
 """Keeps divisors above 0; the darkest grey level is 3e-4."""
 
 
-def without_negative_light(blurred: BlurredPicture, luma: Image, along: PathBlur, scale: int, steps: int) -> Image:
+@dataclass(frozen=True, slots=True)
+class PathBlur:
+    """The blur along the paths of pictures (height, width[, 3]) of reduced size, and its transpose."""
+
+    scale: int
+    """How many times smaller than the recorded picture they are."""
+    blur: Callable[[Image], Image]
+    unblur: Callable[[Image], Image]
+
+
+def without_negative_light(blurred: BlurredPicture, luma: Image, along: PathBlur, steps: int) -> Image:
     """Restored luma, perhaps at reduced size, without negative light, and as bright around it as before.
 
     The luma would still be recorded as with its negative light: where there is none, nothing changes.  Ringing beside a
-    bright thing on dark ground shrinks to the ground's own light.  along: of pictures ``scale`` times smaller than the
-    recorded one, at which the steps work.
+    bright thing on dark ground shrinks to the ground's own light.  The steps work at the scale of ``along``.
     """
-    blur, unblur = along
     light = luma - _darkest(blurred)
     positive = cv2.max(light, 0.0)
-    small, least = shrunk(positive, blurred, scale), _light_of_noise(blurred, blurred.statistics.noise_levels)
-    seen, factor = cv2.max(blur(shrunk(light, blurred, scale)), 0.0), np.ones_like(small)
-    for _ in range(steps):
-        would = blur(cv2.multiply(small, factor))
-        factor = cv2.multiply(factor, unblur(cv2.divide(seen + least, would + least)))
+    least = _light_of_noise(blurred, blurred.statistics.noise_levels)
+    small, seen = shrunk(positive, blurred, along.scale), along.blur(shrunk(light, blurred, along.scale))
+    factor = _consistency_factor(small, cv2.max(seen, 0.0), along, least, steps)
     factor = cv2.resize(factor, luma.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return cv2.multiply(positive, factor) + _darkest(blurred)
 
@@ -61,22 +66,37 @@ def consistent_light(
 
     A channel that is nearly dark, as red is on a green leaf, would be too bright, and striped.  The noise of the
     recorded light is added to both sides of the ratio; light that was not measured corrects nothing.  The luma,
-    restored with a better prior, stays as it is.  All are ``scale`` times smaller than the picture.
+    restored with a better prior, stays as it is.  All are ``scale`` times smaller than the picture; the steps work at
+    the scale of ``along``, which may be coarser.
     """
-    blur, unblur = along
-    darkest = _darkest(blurred)
-    seen, light, luma = cv2.merge(recorded) - darkest, cv2.merge(restored) - darkest, luma - darkest
-    light = cv2.max(light, 0.0)
+    darkest, times = _darkest(blurred), along.scale // scale
+    light = [cv2.max(channel - darkest, 0.0) for channel in restored]
+    coarse, seen = (cv2.merge([block_means(channel, times) for channel in channels]) for channels in (light, recorded))
     noise = float(np.hypot(blurred.statistics.noise_levels, blurred.chroma.colour_noise_levels))
-    least, measured = _light_of_noise(blurred, noise), _measured(blurred, scale)
+    measured = _measured(blurred, along.scale)
+    factor = _consistency_factor(coarse, seen - darkest, along, _light_of_noise(blurred, noise), steps, measured)
+    if times > 1:
+        height, width = (times * length for length in factor.shape[:2])
+        factor = cv2.resize(factor, (width, height), interpolation=cv2.INTER_LINEAR)[: len(luma), : luma.shape[1]]
+    channels = [cv2.multiply(*planes) for planes in zip(light, cv2.split(factor), strict=True)]
+    brighter = cv2.divide(cv2.max(luma - darkest, 0.0), cv2.max(luma_of(channels), LEAST_LIGHT))
+    return [cv2.multiply(channel, brighter) + darkest for channel in channels]
+
+
+def _consistency_factor(
+    light: Image, seen: Image, along: PathBlur, least: float, steps: int, measured: Image | None = None
+) -> Image:
+    """What ``light`` is multiplied by so that it would be recorded as ``seen``: Richardson–Lucy steps.
+
+    least: added to both sides of the ratio, in whose place nothing is known.  measured: 0 where nothing was recorded.
+    """
+    factor = np.ones_like(light)
     for _ in range(steps):
-        ratio = cv2.divide(seen + least, blur(light) + least)
+        ratio = cv2.divide(seen + least, along.blur(cv2.multiply(light, factor)) + least)
         if measured is not None:
             ratio = 1 + measured * (ratio - 1)
-        light = cv2.multiply(light, unblur(ratio))
-    channels = cv2.split(light)
-    brighter = cv2.divide(cv2.max(luma, 0.0), cv2.max(luma_of(list(channels)), LEAST_LIGHT))
-    return [cv2.multiply(channel, brighter) + darkest for channel in channels]
+        factor = cv2.multiply(factor, along.unblur(ratio))
+    return factor
 
 
 def shrunk(luma: Image, blurred: BlurredPicture, scale: int) -> Image:
@@ -119,7 +139,7 @@ def blur_along_paths(blurred: BlurredPicture, scale: int) -> PathBlur:
         whole *= np.float32(1 / count)
         return cv2.GaussianBlur(whole, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE) if sigma_px else whole
 
-    return lambda picture: gathered(picture, 1), lambda picture: gathered(picture, -1)
+    return PathBlur(scale, lambda picture: gathered(picture, 1), lambda picture: gathered(picture, -1))
 
 
 def _measured(blurred: BlurredPicture, scale: int) -> Image | None:
