@@ -79,6 +79,8 @@ class PhotometricFit:
     """Sum of the robust losses, in squared noise σ."""
     memory: float
     """Encoder memory, fitted with the values; its uncertainty is in their covariance."""
+    memory_error: Array
+    """(k,) the part of each value's standard deviation that the uncertainty of the memory makes, with its sign."""
 
     @property
     def std(self) -> Array:
@@ -115,10 +117,12 @@ def fit_photometry(
     start = _best_start(chosen, profile, effects, starts)
     evidence = _Brightness(chosen, profile, effects, start)
     found = descend(evidence, start)
-    covariance = _covariance(evidence, found)[:-1, :-1]
+    by_memory = MEMORY_ERROR * found.state[-1] * _memory_sensitivity(found.normal)
+    covariance = _covariance(evidence, found, by_memory)[:-1, :-1]
     final, memory = evidence.applied(found.state), float(found.state[-1])
     rms = normalised_rms(chosen.with_memory(memory), final)[0]
-    return PhotometricFit(effects, found.state[:-1], covariance, final, rms, 2 * found.cost(1.0), memory)
+    cost = 2 * found.cost(1.0)
+    return PhotometricFit(effects, found.state[:-1], covariance, final, rms, cost, memory, by_memory[:-1])
 
 
 def pulls(
@@ -180,14 +184,16 @@ def significance(
 ) -> tuple[float, float]:
     """(normal deviate equivalent to the p value, p value of no change); includes RESOLUTION and frequency search.
 
-    given: the profile that the change is counted from.
+    An error of the encoder's memory scales a flicker's amplitude, so it makes none where there is none: it does not
+    count against the presence of flicker.  given: the profile that the change is counted from.
     """
     values, covariance = fit.of(effect_name)
     if effect_name == "flicker" and given.extensions.flicker_amplitude:
         change = flicker_change(given, values)
         p = chi2_tail(float(change @ np.linalg.solve(covariance, change)), len(change))
     elif effect_name == "flicker":
-        z2 = values[0] ** 2 / covariance[0, 0]
+        by_memory = next(fit.memory_error[own.start] for effect, own in _parts(fit.effects) if effect.name == "flicker")
+        z2 = values[0] ** 2 / (covariance[0, 0] - by_memory**2)
         span_s = float(np.ptp(observations.stamp_s))
         trials = max(np.ptp(SEARCH_HZ) * span_s, 1.0)
         p = float(-np.expm1(trials * np.log1p(-min(np.exp(-0.5 * z2), 1 - 1e-12))))
@@ -363,10 +369,11 @@ class _Brightness:
 # ── covariance ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _covariance(evidence: _Brightness, found: System[Array, Residuals]) -> Array:
+def _covariance(evidence: _Brightness, found: System[Array, Residuals], by_memory: Array) -> Array:
     """Sandwich covariance with scores clustered by time block and by place; never below that of white noise.
 
-    Values per frame make the score sums of a block vanish, so with them only places are clusters.
+    Values per frame make the score sums of a block vanish, so with them only places are clusters.  by_memory: errors
+    (k + 1,) of the values by the memory's.
     """
     observations, effects, values = evidence.observations, evidence.effects, found.state
     score, by_frame = found.score, any(effect.per_frame for effect in effects)
@@ -375,7 +382,6 @@ def _covariance(evidence: _Brightness, found: System[Array, Residuals]) -> Array
         spread = spread + scatter(score, time_blocks(observations)) - score.T @ score
     white: Array = found.inverse() * max(float(np.sum(found.weight * found.squared) / np.sum(found.weight)), 1.0)
     sandwich = found.sandwich(spread)
-    by_memory = MEMORY_ERROR * values[-1] * _memory_sensitivity(found.normal)
     lag = LAG_ERROR * _changes(observations, effects, values)
     model = (
         np.outer(by_memory, by_memory) + np.diag(lag**2) + _resolution(observations, evidence.profile, effects, values)
@@ -395,24 +401,27 @@ def _resolution(
     for effect, own in _parts(effects):
         square = RESOLUTION[effect.name] ** 2
         if effect.name == "flicker":
-            added[own, own] = square * _flicker_resolution(observations, profile, float(values[own.start]))
+            added[own, own] = square * _flicker_resolution(observations, profile, values[own])
         else:
             added[own, own] = np.diag(np.full(len(effect.parameters), square))
     return added
 
 
-def _flicker_resolution(observations: PhotometricObservations, profile: CameraProfile, amplitude: float) -> Array:
-    """Covariance (3, 3) of (amplitude, frequency, phase), over ε², from an error ε of a flicker's complex amplitude.
+def _flicker_resolution(observations: PhotometricObservations, profile: CameraProfile, values: Array) -> Array:
+    """Covariance (3, 3) of (amplitude, frequency, phase), over ε², from an error ε of a flicker's visible amplitude.
 
-    A component across the amplitude changes the phase at the middle of the capture by ε / amplitude.  If it varies over
-    the capture with the same mean, as an encoder's error does, it changes the frequency by √12 / (2π duration) times
-    that, and with it the phase at time 0.
+    An exposure of nearly whole periods leaves little of the lamp's amplitude visible.  A component across the amplitude
+    changes the phase at the middle of the capture by ε over the visible one.  If it varies over the capture with the
+    same mean, as an encoder's error does, it changes the frequency by √12 / (2π duration) times that, and with it the
+    phase at time 0.
     """
     time_s = observations.row_time_s(profile)
     middle, duration = float(time_s.mean()), max(float(np.ptp(time_s)), 0.1)
-    at_middle = 1 / max(abs(amplitude), RESOLUTION["flicker"])
+    exposure_s = profile.shutter.true_exposure_s(observations.exposure_s)
+    share = max(float(np.sqrt(np.mean(np.sinc(values[1] * exposure_s) ** 2))), RESOLUTION["flicker"])
+    at_middle = 1 / max(abs(float(values[0])) * share, RESOLUTION["flicker"])
     drift = at_middle * np.sqrt(12) / (2 * np.pi * duration) * np.array([0.0, 1.0, -2 * np.pi * middle])
-    return np.diag([1.0, 0.0, at_middle**2]) + np.outer(drift, drift)
+    return np.diag([share**-2, 0.0, at_middle**2]) + np.outer(drift, drift)
 
 
 def _changes(observations: PhotometricObservations, effects: Sequence[PhotometricEffect], values: Array) -> Array:
