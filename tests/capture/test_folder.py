@@ -255,6 +255,14 @@ def test_exposures_in_other_units_are_not_called_missing(writer, exposure, says)
     assert says in next(note.text for note in capture.notes if note.code == "exposure-unknown")
 
 
+@pytest.mark.parametrize(("exposure", "noted"), [("16000", True), ("40000", False)])
+def test_exposures_a_thousand_times_too_short_are_doubted(writer, exposure, noted):
+    """Microseconds under a header of nanoseconds are used as written, with a note that quotes the longest."""
+    writer.exposure_ns = exposure
+    texts = [note.text for note in read_capture(writer.write()).notes if note.code == "exposure-short"]
+    assert texts == ["movie_metadata.csv has no exposure time above 16 µs (are they in the header's unit?)"] * noted
+
+
 def test_a_link_to_no_movie_is_called_one(writer):
     """The hint names the missing target."""
     writer.write()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.image_formation.point_model import integrate_motion, predict
-from virest.inference.guidance import gyro_guide
+from virest.inference.guidance import gyro_guide, map_between
 from virest.inference.guide_choice import find_guide
 from virest.inference.observed_tracks import track_table
 from virest.inference.tracking import TrackPair, track_pairs
@@ -219,3 +219,16 @@ def test_the_map_matches_the_forward_model(wall: Recording) -> None:
     assert np.abs(between.first_of(there) - points).max() < 0.005
     pair = TrackPair(4, 5, points, there)
     assert np.abs(put_by(wall, wall.phone.profile, pair) - there).max() < 0.01
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_map_beyond_the_picture_stays_finite() -> None:
+    """At 12 rad/s, frames share nothing: the inverse map has no solution, and ends without an overflow."""
+
+    def first_of(points: Array) -> Array:
+        return points + 900.0 + 0.01 * points**2
+
+    bend = map_between(first_of, (240, 320), 1)
+    corners = np.array([[0.0, 0.0], [319.0, 0.0], [0.0, 239.0], [319.0, 239.0]])
+    assert np.isfinite(bend.second_of(corners)).all()
+    np.testing.assert_allclose(bend.first_of(corners), first_of(corners), atol=1e-6)

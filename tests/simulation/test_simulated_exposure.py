@@ -235,3 +235,11 @@ def test_a_sliding_scene_is_blurred_by_its_own_motion():
     spread = np.average((columns - np.average(columns, weights=weight.sum(0))) ** 2, weights=weight.sum(0))
     box = (speed_px_s * exposure_s) ** 2 / 12
     assert spread == pytest.approx(3.0**2 + box, rel=0.1)
+
+
+@pytest.mark.filterwarnings("error")
+def test_rays_past_the_horizon_of_the_chart_carry_light() -> None:
+    """A camera that looks along the chart's plane or away from it sees the horizon, at any rate of rotation."""
+    quarter = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    x, y = np.meshgrid(np.linspace(-1, 1, 9, dtype=np.float32), np.linspace(-1, 1, 7, dtype=np.float32))
+    assert (plain_scene(0.5).sample(quarter, x, y) == 0.5).all()

@@ -12,6 +12,8 @@ PLAUSIBLE_FOCAL = (0.55, 1.1)
 """fx over the long side of a phone's main camera."""
 BEARABLE_FOCAL = (0.4, 1.6)
 """Outside, fx is not in pixels of the movie but of the sensor's active array."""
+THOUSANDTH_S = 34e-6
+"""The longest exposure at 30 frames/s, a thousand times too short: without longer ones, the unit is in doubt."""
 PLAUSIBLE_ASPECT = (0.5, 2.0)
 """fy over fx: 1 for square pixels, up to 16:9 for stretched movies."""
 
@@ -44,6 +46,9 @@ def summarise(files: Source, notes: list[Note]) -> CaptureMetadata:
         if table.odd_exposure_s is not None:
             why = f"has exposure times such as {table.odd_exposure_s:.3g} s (are they in the header's unit?)"
         notes.append(Note("warning", "exposure-unknown", f"{name} {why}: no deblurring"))
+    elif (longest_s := float(np.nanmax(table.exposure_s))) < THOUSANDTH_S:
+        text = f"{name} has no exposure time above {1e6 * longest_s:.3g} µs (are they in the header's unit?)"
+        notes.append(Note("warning", "exposure-short", text))
     return CaptureMetadata(
         fx_px=fx,
         fy_px=fy,

@@ -89,10 +89,10 @@ class SmoothField:
     shape: tuple[int, int]
 
     def at(self, points_px: Array) -> Array:
-        """Vectors (n, 2) at points (n, 2)."""
+        """Vectors (n, 2) at points (n, 2); beyond the picture, where a polynomial runs away, those of its edge."""
         height, width = self.shape
-        down = _basis(2 * points_px[:, 1] / (height - 1) - 1)
-        across = _basis(2 * points_px[:, 0] / (width - 1) - 1)
+        down = _basis(np.clip(2 * points_px[:, 1] / (height - 1) - 1, -1.0, 1.0))
+        across = _basis(np.clip(2 * points_px[:, 0] / (width - 1) - 1, -1.0, 1.0))
         return np.stack([((down @ self.coefficients[..., c]) * across).sum(axis=1) for c in (0, 1)], axis=-1)
 
     def at_pixels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

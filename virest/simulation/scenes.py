@@ -31,6 +31,8 @@ MAX_CHART_PX = 36_000_000
 """0.4 GB as 32-bit RGB."""
 PHOTOGRAPHS = ("astronaut", "chelsea", "coffee", "rocket")
 """Colour photographs in scikit-image: a portrait, fur, a table, a rocket at night."""
+HORIZON = np.float32(1e-3)
+"""Least denominator of the map from rays to the chart: rays along its plane, or away from it, meet no point of it."""
 _TEXTURE_SIDE = 512
 """All leaves cut their texture from one periodic picture: larger than a leaf, and fast to transform."""
 _TEXT = (
@@ -109,9 +111,12 @@ class Scene:
         return Scene(self.chart, self.chart_focal_px, depth_m, normal, self.drift_per_s)
 
     def sample(self, homography: Array, x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
-        """Light along rays (x, y, 1), bilinear between chart pixels, mirrored outside: (h, w, channels)."""
+        """Light along rays (x, y, 1), bilinear between chart pixels, mirrored outside: (h, w, channels).
+
+        Rays that miss the chart's plane see its horizon.
+        """
         h = homography.astype(np.float32)
-        weight = 1.0 / (h[2, 0] * x + (h[2, 1] * y + h[2, 2]))
+        weight = 1.0 / np.maximum(h[2, 0] * x + (h[2, 1] * y + h[2, 2]), HORIZON)
         map_x = h[0, 0] * x + (h[0, 1] * y + h[0, 2])
         map_y = h[1, 0] * x + (h[1, 1] * y + h[1, 2])
         map_x *= weight
