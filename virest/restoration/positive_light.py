@@ -130,16 +130,16 @@ def blur_along_paths(blurred: BlurredPicture, scale: int) -> PathBlur:
     instants = ((np.arange(count) + 0.5) / count * paths_px.shape[2]).astype(int).tolist()
     own = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), -1)
     moved = [cv2.resize(paths_px[:, :, k], (width, height), interpolation=cv2.INTER_LINEAR) for k in instants]
+    ahead, behind = ([cv2.scaleAdd(shift, sign, own) for shift in moved] for sign in (1.0, -1.0))
 
-    def gathered(picture: Image, sign: int) -> Image:
+    def gathered(picture: Image, sources: list[Image]) -> Image:
         whole = np.zeros_like(picture)
-        for shift in moved:
-            source = cv2.scaleAdd(shift, float(sign), own)
+        for source in sources:
             cv2.accumulate(cv2.remap(picture, source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), whole)
         whole *= np.float32(1 / count)
         return cv2.GaussianBlur(whole, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE) if sigma_px else whole
 
-    return PathBlur(scale, lambda picture: gathered(picture, 1), lambda picture: gathered(picture, -1))
+    return PathBlur(scale, lambda picture: gathered(picture, ahead), lambda picture: gathered(picture, behind))
 
 
 def _measured(blurred: BlurredPicture, scale: int) -> Image | None:
