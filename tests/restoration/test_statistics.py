@@ -9,9 +9,11 @@ from laws import texture
 from numpy.typing import NDArray
 
 from virest.camera.response import ResponseCurve
+from virest.image_formation.blur import tile_grid
 from virest.image_formation.kernels import KernelField
 from virest.restoration.statistics import ring_fit, tile_power
 from virest.restoration.statistics.measure import measure_picture
+from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, detailed
 from virest.restoration.statistics.on_tiles import on_spectrum
 from virest.restoration.statistics.place_fit import unevenness
 from virest.restoration.statistics.records import PictureStatistics, coder_noise
@@ -374,3 +376,26 @@ def test_chroma_is_measured_where_the_picture_has_colour() -> None:
     everywhere, here_and_there = (measure_picture(p, field, STRAIGHT)[1] for p in (coloured, striped))
     np.testing.assert_allclose(here_and_there.signal[1:8], everywhere.signal[1:8], rtol=0.7)
     assert here_and_there.noise_to_signal[2] < 3 * everywhere.noise_to_signal[2]
+
+
+@pytest.mark.parametrize(
+    ("flat_noise", "step", "flat_counts"),
+    [(0.0, 20.0, False), (0.6, 20.0, False), (0.0, None, False), (3.0, None, True), (3.0, 2.0, True)],
+)
+def test_blank_tiles_tell_nothing_about_noise(
+    flat_noise: float, step: float | None, flat_counts: bool, rng: np.random.Generator
+) -> None:
+    """Beside print, a bare page counts only if it shows more than the coder drops, such as the sensor's noise."""
+    page = np.full((512, 512), 230.0) - np.linspace(0, 40, 512)  # lit from one side
+    page[:, :256] -= 180 * (cv2.GaussianBlur(rng.random((512, 256)), (0, 0), 2.0) > 0.52)
+    picture = np.clip(np.rint(page + flat_noise * rng.standard_normal(page.shape)), 0, 255).astype(np.uint8)
+    centres_px = tile_grid(512, 512, SAMPLE_TILE_PX, 0).centres_px
+    kept = detailed(picture, centres_px, step)
+    assert {tuple(c) for c in kept} >= {tuple(c) for c in centres_px if c[0] < 256}
+    assert (len(kept) == len(centres_px)) == flat_counts
+
+
+def test_a_blank_picture_is_measured_as_a_whole() -> None:
+    """Where no tile shows anything, all count."""
+    centres_px = tile_grid(512, 512, SAMPLE_TILE_PX, 0).centres_px
+    np.testing.assert_array_equal(detailed(np.full((512, 512, 3), 200, np.uint8), centres_px, 10.0), centres_px)

@@ -14,13 +14,17 @@ from virest.image_formation.kernels import KernelField, blur_chords
 from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import clipped_anywhere
 from virest.restoration.statistics.measure import measure_picture
-from virest.restoration.statistics.records import PictureStatistics, falling_power
+from virest.restoration.statistics.records import ROUNDING_POWER, PictureStatistics, coded_variance, falling_power
 from virest.restoration.statistics.rings import SIDE
 
 SAMPLE_TILE_PX = 128
 """Spacing of the tiles on which a picture's noise is measured."""
 MIN_SAMPLES = 6
 """Measure at least this many tiles, the most blurred ones."""
+_COARSE_PX = 8
+"""Side of the block means in which a tile's detail is looked for: shake blurs finer detail."""
+_LAPLACIAN_POWER = 20.0
+"""Sum of the squared weights of OpenCV's Laplacian: the factor by which it raises the variance of white noise."""
 LARGEST_RADIUS = SIDE // 4
 """Largest kernel radius, px: larger kernels leave too little of a tile that its window does not attenuate."""
 CURVE_SLOPE_STD = 0.1
@@ -31,6 +35,24 @@ picture's own detail wherever brightness changes, blurred or not: extra noise ε
 0.103 ± 0.015 gains most (``python -m virest.app.bench --only fits``); it is not based on measured curves."""
 _LEAST_FALL = 2.0
 """Least exponent of the fall of picture power with frequency: f⁻² is that of edges alone, without texture."""
+
+
+def detailed(picture: NDArray[np.uint8], centres_px: Array, coding_step: float | None) -> Array:
+    """Centres (m, 2) of the tiles of a picture (height, width[, 3]) that show more than a coder drops; all if none do.
+
+    The coder drops what is below its error, with its noise (reverse water-filling, see :func:`coder_noise`), so a white
+    wall looks free of noise, whatever the error elsewhere.  A tile counts as blank if even its coarse detail, the
+    Laplacian of block means, has less power than that error.
+    """
+    height, width = picture.shape[:2]
+    rows, columns = max(height // _COARSE_PX, 1), max(width // _COARSE_PX, 1)
+    luma = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    coarse = cv2.resize(luma, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32)
+    power = cv2.blur(cv2.Laplacian(coarse, cv2.CV_32F) ** 2, (SIDE // _COARSE_PX,) * 2)
+    x, y = ((centres_px + 0.5) / _COARSE_PX).astype(int).T
+    power = power[np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)] * (_COARSE_PX**2 / _LAPLACIAN_POWER)
+    shown = power > (ROUNDING_POWER if coding_step is None else coded_variance(coding_step))
+    return centres_px[shown] if shown.any() else centres_px
 
 
 def most_blurred(motion: RowMotion, centres_px: Array) -> Array:
