@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from virest.app.bench import __main__ as bench
-from virest.app.bench import commands, compare, growth, memory, peers, quality, speed, summary
+from virest.app.bench import commands, compare, fields, growth, memory, peers, quality, speed, summary
 from virest.app.bench.workload import (
     Run,
     Scale,
@@ -482,3 +482,15 @@ def test_the_quality_table_averages_only_kinds_with_several_captures() -> None:
     assert "ALL ordinary" not in means
     assert means.splitlines()[-2].split()[-7:-5] == ["20.00", "+1.75"]
     assert worst.splitlines()[-1].split()[-3:] == ["+1.25", "+1.00", "+1.00"]
+
+
+def test_the_summary_of_unknown_effects_can_be_saved() -> None:
+    """Counts of numpy's truth values are numbers that JSON holds; captures without an effect count as nulls."""
+    effect = {"hidden": "uneven", "right": np.True_, "fields": ["a field"], "gone_elsewhere": np.float64(0.9)}
+    rows = [{**effect, "pictures_db": [np.float64(0.5), np.float64(-0.2)]}]
+    rows.append({**effect, "hidden": fields.NULL, "fields": [], "gone_elsewhere": None, "pictures_db": []})
+    found = json.loads(json.dumps(fields.summarise(rows)))
+    assert found == {
+        "captures": 1, "right": 1, "solved_elsewhere": 1, "of_elsewhere": 1, "pictures_better": 1, "pictures_worse": 1,
+        "of_pictures": 1, "false_alarms": 0, "nulls": 1,
+    }  # fmt: skip

@@ -386,7 +386,7 @@ def test_blank_tiles_tell_nothing_about_noise(
     flat_noise: float, step: float | None, flat_counts: bool, rng: np.random.Generator
 ) -> None:
     """Beside print, a bare page counts only if it shows more than the coder drops, such as the sensor's noise."""
-    page = np.full((512, 512), 230.0) - np.linspace(0, 40, 512)  # lit from one side
+    page = np.full((512, 512), 230.0) - np.linspace(0, 40 if step else 0, 512)  # lit from one side
     page[:, :256] -= 180 * (cv2.GaussianBlur(rng.random((512, 256)), (0, 0), 2.0) > 0.52)
     picture = np.clip(np.rint(page + flat_noise * rng.standard_normal(page.shape)), 0, 255).astype(np.uint8)
     centres_px = tile_grid(512, 512, SAMPLE_TILE_PX, 0).centres_px

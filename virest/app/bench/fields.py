@@ -6,7 +6,7 @@ The diagnosis reads only the capture folder.  The seed of a case determines sign
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -439,19 +439,7 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     cases += [(NAMED_ONLY, FIRST_SEED + 500 + k) for k in range(SEEDS[scale.name])]
     cases += [(NULL, FIRST_NULL + k) for k in range(NULLS[scale.name])]
     rows = [judge_case(work, *case) for case in cases]
-    hidden = [row for row in rows if row["hidden"] in EFFECTS]
-    elsewhere = [row["gone_elsewhere"] for row in hidden if row["gone_elsewhere"] is not None]
-    summary = {
-        "captures": len(hidden),
-        "right": sum(row["right"] for row in hidden),
-        "solved_elsewhere": sum(fraction >= SOLVED for fraction in elsewhere),
-        "of_elsewhere": len(elsewhere),
-        "pictures_better": sum(np.mean(row["pictures_db"]) > HARM_DB for row in rows if row["pictures_db"]),
-        "pictures_worse": sum(min(row["pictures_db"]) < -HARM_DB for row in rows if row["pictures_db"]),
-        "of_pictures": sum(bool(row["pictures_db"]) for row in rows),
-        "false_alarms": sum(bool(row["fields"]) for row in rows if row["hidden"] not in EFFECTS),
-        "nulls": len(rows) - len(hidden),
-    }
+    summary = summarise(rows)
     header = ["hidden", "seed", "size", "verdict", "causes", "fields", "gain", "elsewhere", "frames dB",
               "rms / noise px", "CPU s"]  # fmt: skip
     text = numeric_table(header, [shown(row) for row in rows])
@@ -462,6 +450,23 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
         f"alarms in {summary['nulls']} captures without an unknown effect"
     )
     return {"summary": summary, "rows": rows}, f"Effects that no catalogue names, {FRAMES} frames\n{text}"
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, int]:
+    """Counts over all cases."""
+    hidden = [row for row in rows if row["hidden"] in EFFECTS]
+    elsewhere = [row["gone_elsewhere"] for row in hidden if row["gone_elsewhere"] is not None]
+    return {
+        "captures": len(hidden),
+        "right": sum(bool(row["right"]) for row in hidden),
+        "solved_elsewhere": sum(bool(fraction >= SOLVED) for fraction in elsewhere),
+        "of_elsewhere": len(elsewhere),
+        "pictures_better": sum(bool(np.mean(row["pictures_db"]) > HARM_DB) for row in rows if row["pictures_db"]),
+        "pictures_worse": sum(bool(min(row["pictures_db"]) < -HARM_DB) for row in rows if row["pictures_db"]),
+        "of_pictures": sum(bool(row["pictures_db"]) for row in rows),
+        "false_alarms": sum(bool(row["fields"]) for row in rows if row["hidden"] not in EFFECTS),
+        "nulls": len(rows) - len(hidden),
+    }
 
 
 def shown(row: Row) -> list[str]:
