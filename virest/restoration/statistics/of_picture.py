@@ -42,13 +42,13 @@ def detailed(picture: NDArray[np.uint8], centres_px: Array, coding_step: float |
 
     The coder drops what is below its error, with its noise (reverse water-filling, see :func:`coder_noise`), so a white
     wall looks free of noise, whatever the error elsewhere.  A tile counts as blank if even its coarse detail, the
-    Laplacian of block means, has less power than that error.
+    Laplacian of block means, has less power than that error in its middle half, which the window keeps.
     """
     height, width = picture.shape[:2]
     rows, columns = max(height // _COARSE_PX, 1), max(width // _COARSE_PX, 1)
     luma = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     coarse = cv2.resize(luma.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
-    power = cv2.blur(cv2.Laplacian(coarse, cv2.CV_32F) ** 2, (SIDE // _COARSE_PX,) * 2)
+    power = cv2.blur(cv2.Laplacian(coarse, cv2.CV_32F) ** 2, (SIDE // (2 * _COARSE_PX),) * 2)
     x, y = ((centres_px + 0.5) / _COARSE_PX).astype(int).T
     power = power[np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)] * (_COARSE_PX**2 / _LAPLACIAN_POWER)
     shown = power > (ROUNDING_POWER if coding_step is None else coded_variance(coding_step))
