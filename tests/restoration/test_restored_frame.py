@@ -296,6 +296,22 @@ def test_noise_is_measured_where_the_blur_is() -> None:
     assert far.min() > 0.4 * far.max()
 
 
+def test_a_bare_page_does_not_hide_the_noise_of_print_beside_it() -> None:
+    """A coder leaves a bare page without noise; the noise of the rest is measured all the same."""
+    turning = camera((0.0, 0.0, 2.0))
+    recorded, noise = record(turning).picture, {}
+    bare = recorded.copy()
+    bare[:, :40], bare[:, -120:] = 230, 230
+    for name, picture in (("print", recorded), ("page", bare)):
+        found = restore_frame(
+            FRAME, picture, turning.motion, turning.trajectory, PRESETS["balanced"], coding_step=12.0
+        ).degradation
+        assert found is not None
+        assert found.deblur is not None
+        noise[name] = found.deblur.noise_grey_levels
+    assert noise["page"] == pytest.approx(noise["print"], rel=0.5)
+
+
 def test_few_iterations_assume_coding_noise() -> None:
     """``fast`` assumes at least half of the noise of steps of 60 grey levels, ``balanced`` the measured noise."""
     turning = camera()
@@ -527,11 +543,12 @@ def test_consistent_light_is_unchanged_even_below_zero() -> None:
     """The curve's zero of light is a convention: uniform surfaces stay on either side of it."""
     curve = ResponseCurve("five_segment", b=(0.12, 0.14), c=(0.62, 0.88), y_max=1.0)
     assert curve.light_range[0] < -0.05
-    channels = [np.full((40, 60), light, np.float32) for light in (-0.05, 0.1, 0.3)]
     blurred = _seen_along(np.linspace(-6, 6, 16)[:, None] * (1.0, 0.3), curve)
-    along = blur_along_paths(blurred, 2)
-    found = consistent_light(blurred, luma_of(channels), channels, channels, along, 2, 2)
-    np.testing.assert_allclose(found, channels, atol=1e-4)
+    channels = [np.full((40, 60), light, np.float32) for light in (-0.05, 0.1, 0.3)]
+    for coarse in (2, 4):
+        along = blur_along_paths(blurred, coarse)
+        found = consistent_light(blurred, luma_of(channels), channels, channels, along, 2, 2)
+        np.testing.assert_allclose(found, channels, atol=1e-4)
     luma = np.full((80, 120), -0.05, np.float32)
     np.testing.assert_allclose(without_negative_light(blurred, luma, along, 2), luma, atol=1e-4)
 

@@ -87,12 +87,14 @@ class PhotometricFit:
         """(k,) standard deviations."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
+    def place(self, effect_name: str) -> slice:
+        """Where the values of one effect are."""
+        return next(own for effect, own in _parts(self.effects) if effect.name == effect_name)
+
     def of(self, effect_name: str) -> tuple[Array, Array]:
         """(values, covariance) of one effect."""
-        for effect, own in _parts(self.effects):
-            if effect.name == effect_name:
-                return self.values[own], self.covariance[own, own]
-        raise KeyError(effect_name)
+        own = self.place(effect_name)
+        return self.values[own], self.covariance[own, own]
 
 
 def time_blocks(observations: PhotometricObservations) -> Index:
@@ -192,8 +194,7 @@ def significance(
         change = flicker_change(given, values)
         p = chi2_tail(float(change @ np.linalg.solve(covariance, change)), len(change))
     elif effect_name == "flicker":
-        by_memory = next(fit.memory_error[own.start] for effect, own in _parts(fit.effects) if effect.name == "flicker")
-        z2 = values[0] ** 2 / (covariance[0, 0] - by_memory**2)
+        z2 = values[0] ** 2 / (covariance[0, 0] - fit.memory_error[fit.place("flicker")][0] ** 2)
         span_s = float(np.ptp(observations.stamp_s))
         trials = max(np.ptp(SEARCH_HZ) * span_s, 1.0)
         p = float(-np.expm1(trials * np.log1p(-min(np.exp(-0.5 * z2), 1 - 1e-12))))

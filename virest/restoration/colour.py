@@ -33,8 +33,8 @@ from virest.restoration.tile_layout import (
 )
 
 COLOUR_SCALE, COARSE_COLOUR_SCALE = 2, 4
-"""Reductions of the colour differences: a movie (4:2:0) stores them at half size.  The coarse scale, used with few
-iterations, costs up to 0.05 dB."""
+"""Reductions of the colour differences: a movie (4:2:0) stores them at half size.  Under long paths the light is
+corrected at the coarse scale; with few iterations the differences are restored there too, which costs up to 0.05 dB."""
 COLOUR_TILE_PX = 192
 """Side of their tiles, which may be larger than the luma's: colour differences hold little detail."""
 COARSE_COLOUR_BLUR_PX = COARSE_COLOUR_SCALE * 3**0.5

@@ -15,7 +15,6 @@ from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
-from virest.image_formation.blur import tile_grid
 from virest.image_formation.kernel_spread import KernelSpread, kernel_spread
 from virest.image_formation.kernels import KernelField, smooth_field
 from virest.image_formation.light import FrameLight, equivalent_length_px, frame_light, most_defocus_px
@@ -41,12 +40,7 @@ from virest.restoration.parameters import (
 from virest.restoration.row_chunks import RowRenderer, bands
 from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.shutter import perspective_map, rounded, rowwise_map, valid_rectangle, warp
-from virest.restoration.statistics.of_picture import (
-    SAMPLE_TILE_PX,
-    detailed,
-    most_blurred,
-    picture_statistics,
-)
+from virest.restoration.statistics.of_picture import measured_centres, picture_statistics
 from virest.restoration.statistics.records import PictureStatistics, coded_variance
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
 from virest.restoration.taken_part import LEAST_CONFIRMED_DB, blurred_part, no_gain_reason, share_map, trusted_share
@@ -339,8 +333,7 @@ def _blur_statistics(
     """Statistics and kernels of a picture (height, width, 3)."""
     height, width = picture.shape[:2]
     curve = blur.motion.profile.curve
-    centres_px = detailed(picture, tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px, blur.coding_step)
-    centres_px = most_blurred(blur.motion, centres_px)
+    centres_px = measured_centres(picture, blur.motion, blur.coding_step)
     few = settings.iterations <= FEW_ITERATIONS
     # with few iterations and an uncertain path, the path's error counts as noise: the coder's is no upper bound
     bounds_luma = not (few and blur.covariance_px2.any())

@@ -18,12 +18,7 @@ from virest.restoration.frame import deblur_method
 from virest.restoration.neighbours.reduced_tiles import reduced
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import RestorationSettings
-from virest.restoration.statistics.of_picture import (
-    SAMPLE_TILE_PX,
-    detailed,
-    most_blurred,
-    picture_statistics,
-)
+from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, measured_centres, picture_statistics
 from virest.restoration.statistics.tile_power import FEW_TILES
 from virest.restoration.taken_part import blurred_part, no_gain_reason, trusted_share
 from virest.restoration.tile_layout import THIN_MARGIN
@@ -52,9 +47,8 @@ def try_restoration(
     if deblur_method(motion, settings, longest_px)[0] == "none":
         return None
     curve, field = motion.profile.curve, smooth_field(motion, ANCHOR)
-    statistics = picture_statistics(
-        luma, field(most_blurred(motion, detailed(luma, centres_px, coding_step))), curve, FEW_TILES, coding_step
-    )
+    measured_px = measured_centres(luma, motion, coding_step)
+    statistics = picture_statistics(luma, field(measured_px), curve, FEW_TILES, coding_step)
     covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
     spread = kernel_spread(field, width, height, covariance_px2)
     model = statistics[0].with_kernel_variance(spread)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from virest.arrays import Array
 from virest.camera.response import ResponseCurve
+from virest.image_formation.blur import tile_grid
 from virest.image_formation.kernels import KernelField, blur_chords
 from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import clipped_anywhere
@@ -35,6 +36,13 @@ picture's own detail wherever brightness changes, blurred or not: extra noise ε
 0.103 ± 0.015 gains most (``python -m virest.app.bench --only fits``); it is not based on measured curves."""
 _LEAST_FALL = 2.0
 """Least exponent of the fall of picture power with frequency: f⁻² is that of edges alone, without texture."""
+
+
+def measured_centres(picture: NDArray[np.uint8], motion: RowMotion, coding_step: float | None) -> Array:
+    """Centres (m, 2) of the tiles of a picture (height, width[, 3]) to measure: the most blurred that show detail."""
+    height, width = picture.shape[:2]
+    centres_px = tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px
+    return most_blurred(motion, detailed(picture, centres_px, coding_step))
 
 
 def detailed(picture: NDArray[np.uint8], centres_px: Array, coding_step: float | None) -> Array:
