@@ -354,13 +354,13 @@ def test_a_frame_has_at_least_the_noise_of_its_coder() -> None:
     frequency = (np.arange(24) + 0.5) / 48
     signal, passed = 100 * (0.02 / frequency) ** 2.5, np.exp(-((6 * frequency) ** 2))
     missed, found = (PictureStatistics(frequency, signal, np.full(24, n), passed, np.sqrt(n)) for n in (0.2, 400.0))
-    least = missed.with_coder_noise(30.0, 0.5)
+    least = missed.with_coder_noise(30.0)
     recorded = passed * signal + missed.noise
     assert np.all(least.noise >= missed.noise)
-    assert np.all(least.noise <= np.maximum(0.5 * recorded, missed.noise) + 1e-9)
-    assert least.noise[0] == pytest.approx(0.5 * coder_noise(recorded, 30.0)[0])
+    assert np.all(least.noise <= np.maximum(recorded, missed.noise) + 1e-9)
+    assert least.noise[0] == pytest.approx(coder_noise(recorded, 30.0)[0])
     assert least.noise_levels > 2 * missed.noise_levels
-    assert found.with_coder_noise(30.0, 0.5).noise_levels == pytest.approx(found.noise_levels)
+    assert found.with_coder_noise(30.0).noise_levels == pytest.approx(found.noise_levels)
 
 
 def test_chroma_is_measured_where_the_picture_has_colour() -> None:

@@ -48,10 +48,6 @@ from virest.restoration.undistortion import undistortion_map
 
 MIN_WARP_PX = 0.1
 """Skip straightening that moves no point further than this: gyroscope noise at rest has the same effect."""
-LEAST_CODER_NOISE = 0.5
-"""Lower bound on a frame's coding noise, over that predicted from the quantiser step: on 35 frames of five simulated
-captures the ratio is 0.5 to 2.5.  Few iterations with few measured tiles amplify noise that the fit missed; more
-iterations, with neighbours, do not."""
 WHOLE_PICTURE = ("hyper-laplacian-global", "richardson-lucy")
 """Methods whose kernels vary smoothly between tiles."""
 NOTHING_LEFT = "straightening would leave no recorded pixel (check lens, axes and clock): not straightened"
@@ -339,8 +335,8 @@ def _blur_statistics(
     bounds_luma = not (few and blur.covariance_px2.any())
     field, most_tiles = smooth_field(blur.motion, blur.anchor), FEW_TILES if few else MANY_TILES
     luma, chroma = picture_statistics(picture, field(centres_px), curve, most_tiles, blur.coding_step, bounds_luma)
-    if few and blur.coding_step is not None:
-        luma = luma.with_coder_noise(blur.coding_step, LEAST_CODER_NOISE)
+    if few and blur.coding_step is not None:  # few iterations amplify noise that the fit missed, and have no neighbours
+        luma = luma.with_coder_noise(blur.coding_step)
     spread = kernel_spread(field, width, height, blur.covariance_px2)
     luma_model = luma.with_kernel_variance(spread)
     share = 1.0 if blur.anchor != 0.5 else trusted_share(luma_model)

@@ -184,11 +184,14 @@ class PictureStatistics:
         share *= 1 - self.unevenness
         return self._with_noise(self.noise + share * self.signal) if self.measured and share else self
 
-    def with_coder_noise(self, step: float, share: float) -> PictureStatistics:
-        """With the noise at least ``share`` times that of a quantiser with this step, grey levels."""
+    def with_coder_noise(self, step: float) -> PictureStatistics:
+        """With the noise at least that of a quantiser with this step, grey levels.
+
+        Few measured tiles scatter below it, and tiles without detail have less of it than those that a filter changes.
+        """
         if not self.measured:
             return self
-        least = share * coder_noise(self.passed * self.signal + self.noise, step)
+        least = coder_noise(self.passed * self.signal + self.noise, step)
         return self._with_noise(np.maximum(self.noise, least))
 
     def _with_noise(self, noise: Array) -> PictureStatistics:
