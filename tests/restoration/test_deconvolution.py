@@ -23,7 +23,6 @@ from virest.restoration.deconvolution import (
 from virest.restoration.statistics.on_tiles import on_spectrum
 from virest.restoration.statistics.records import unknown_picture
 from virest.restoration.statistics.rings import RINGS
-from virest.restoration.tile_layout import BORDER_NOISE_TO_SIGNAL
 from virest.restoration.tile_methods import RESIDUAL_SHARE, _with_residual
 
 Image = NDArray[np.float32]
@@ -232,14 +231,16 @@ def test_faint_texture_is_restored_from_the_residual(rng: np.random.Generator) -
     """
     size = 32
     powers, solved = rng.random((2, 2, size, size)).astype(np.float32)
-    deconvolution = SimpleNamespace(powers=powers, at_border=[False, True], size=size)
+    deconvolution = SimpleNamespace(powers=powers, size=size)
 
     def restored(projected: Image) -> list[Image]:
-        return [tile.copy() for tile in _with_residual(deconvolution, projected, solved, unknown_picture())]  # type: ignore[arg-type]
+        tiles = _with_residual(deconvolution, projected, solved, unknown_picture(), (0.0, 0.7))  # type: ignore[arg-type]
+        return [tile.copy() for tile in tiles]
 
     np.testing.assert_allclose(restored(powers * solved), solved, rtol=1e-6)
     found = restored((powers + 1) * solved)
     ratio = on_spectrum(unknown_picture(), np.full(RINGS, 1 / RESIDUAL_SHARE), size)
-    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
+    guarded = np.maximum(ratio, 0.7 / RESIDUAL_SHARE)
+    guarded[0, 0] = ratio[0, 0]
     for tile, spectrum, power, noise in zip(found, solved, powers, (ratio, guarded), strict=True):
         np.testing.assert_allclose(tile, spectrum + spectrum / (power + noise), rtol=1e-4)

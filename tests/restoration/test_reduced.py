@@ -108,7 +108,7 @@ def test_a_path_longer_than_a_tile_enlarges_the_transform() -> None:
     assert deconvolution.size >= 465
     ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
     projected = deconvolution.back_projected(blurred.light[0])
-    flat = deconvolution.blend(deconvolution.solutions(projected, deconvolution.inside_or_at_border(ratio, ratio)))
+    flat = deconvolution.blend(deconvolution.solutions(projected, [ratio] * len(projected)))
     assert np.isfinite(flat).all()
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from virest.image_formation.blur import Image, fast_size, tile_grid
 from virest.restoration.statistics.on_tiles import packed_frequency
+from virest.restoration.tile_layout import border_noise_to_signal, in_tiles
 from virest.restoration.tiles import (
     FurtherPicture,
     TileDeconvolution,
@@ -158,21 +159,46 @@ def test_the_naive_inverse_is_bounded() -> None:
     np.testing.assert_allclose(inverse_filter(np.array([0.0, 1e-6, 0.25], np.float32)), [1000, 1000, 4], rtol=1e-6)
 
 
-@pytest.mark.parametrize("border", [3e-2, 7e-2])
-def test_the_pull_is_zero_outside_the_picture(border: float) -> None:
-    """Each tile receives the pull at its place, times the factor for tiles inside or at the picture's border."""
+def test_the_pull_is_zero_outside_the_picture() -> None:
+    """Each tile receives the pull at its place, times its own factor."""
     pull = texture(150, 210).astype(np.float32)
     grid = tile_grid(150, 210, 64, 16)
     deconvolution = TileDeconvolution(grid, np.repeat(_lopsided_kernel()[None], len(grid.centres_px), 0), 16)
     nothing = [np.zeros((deconvolution.size,) * 2, np.float32)] * len(deconvolution.kernels)
     beyond = np.pad(pull, 100)
-    pulled = deconvolution.pulled(nothing, pull, 0.5, border)
-    for spectrum, (top, left), at_border in zip(pulled, grid.corners(), deconvolution.at_border, strict=True):
+    factors = np.linspace(0.03, 0.5, len(nothing)).tolist()
+    pulled = deconvolution.pulled(nothing, pull, factors)
+    for spectrum, (top, left), factor in zip(pulled, grid.corners(), factors, strict=True):
         expected = np.zeros((deconvolution.size,) * 2)
         rows, columns = (slice(84 + k, 84 + k + deconvolution.patch) for k in (top, left))
         expected[: deconvolution.patch, : deconvolution.patch] = beyond[rows, columns]
         tile = cv2.idft(spectrum, flags=cv2.DFT_SCALE)
-        np.testing.assert_allclose(tile, expected * (border if at_border else 0.5), atol=1e-5)
+        np.testing.assert_allclose(tile, expected * factor, atol=1e-5)
+
+
+def test_a_lamp_at_the_border_does_not_ring() -> None:
+    """A lamp that enters a dark picture fits no blur beyond the border: tiles there are filtered less.
+
+    Filtered as usual, dark and bright spots a blur length apart reach 40 px inwards.
+    """
+    recorded = _filtered(0.05 + 0.02 * texture(320, 320).astype(np.float32), packed_frequency(320) < 0.04)
+    grid, kernel = tile_grid(320, 320, 96, 24), _stroke(False)
+    deconvolution = TileDeconvolution(grid, np.repeat(kernel[None], len(grid.centres_px), 0), 12)
+    usual = border_noise_to_signal(deconvolution, recorded, 11.0)
+    assert 0 < usual.count(0.0) < len(usual)
+    recorded[-2:, 150:158] = 0.8
+    least = border_noise_to_signal(deconvolution, recorded, 11.0)
+    ratio = np.full((deconvolution.size,) * 2, 3e-4, np.float32)
+    projected = deconvolution.back_projected(recorded)
+
+    def ripple(least: list[float]) -> float:
+        sharp = deconvolution.blend(deconvolution.solutions(projected, in_tiles(ratio, least)))
+        return float(np.abs(sharp - recorded)[-40:-14, 140:170].max())
+
+    changed = [corner for corner, a, b in zip(grid.corners(), usual, least, strict=True) if b > 2 * a]
+    assert changed
+    assert all(top + 96 > 306 and left < 170 and left + 120 > 140 for top, left in changed)
+    assert ripple(least) < 0.3 * ripple(usual)
 
 
 @pytest.mark.parametrize(("height", "width", "margin"), [(480, 640, 16), (1280, 720, 23), (360, 640, 8), (90, 70, 41)])
@@ -243,7 +269,7 @@ def _filtered_with_lamps(deconvolution: TileDeconvolution, recorded: NDArray[np.
     ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
     projected = deconvolution.back_projected(recorded)
     return deconvolution.restore_highlights(
-        deconvolution.blend(deconvolution.solutions(projected, deconvolution.inside_or_at_border(ratio, ratio)))
+        deconvolution.blend(deconvolution.solutions(projected, [ratio] * len(projected)))
     )
 
 
@@ -357,11 +383,8 @@ def test_another_blur_path_restores_lost_frequencies() -> None:
 
     def error(deconvolution: TileDeconvolution) -> float:
         ratio = np.full((deconvolution.size,) * 2, 1e-3, np.float32)
-        restored = deconvolution.blend(
-            deconvolution.solutions(
-                deconvolution.back_projected(first), deconvolution.inside_or_at_border(ratio, ratio)
-            )
-        )
+        projected = deconvolution.back_projected(first)
+        restored = deconvolution.blend(deconvolution.solutions(projected, [ratio] * len(projected)))
         return float(np.mean((restored - sharp)[20:-20, 20:-20] ** 2))
 
     together = error(_joined(first, across, second, down))

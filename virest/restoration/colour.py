@@ -26,6 +26,7 @@ from virest.restoration.statistics.records import LUMA_BLUE, LUMA_GREEN, LUMA_RE
 from virest.restoration.statistics.tile_power import variance_within
 from virest.restoration.tile_layout import (
     COARSE_OVERLAP,
+    border_noise_to_signal,
     in_tiles,
     join_neighbours,
     noise_to_signal,
@@ -116,7 +117,7 @@ def _sharp_differences(
         cv2.blur(slope, (side, side))
         for slope in _regression_slopes(luma, differences, cv2.multiply(noise, noise), side)
     ]
-    ratio = noise_to_signal(deconvolution, settings, blurred.chroma, scale)[0]
+    ratio = noise_to_signal(deconvolution, settings, blurred.chroma, scale)
     factors = _noise_to_signal_factors(deconvolution.grid, differences, steepness, blurred.chroma, scale)
 
     def left_over(luma: Image, differences: list[Image]) -> list[Image]:
@@ -134,7 +135,8 @@ def _sharp_differences(
     )
     for number, (left, slope) in enumerate(zip(own, slopes, strict=True)):
         projected = deconvolution.back_projected(left, number)
-        filtered = deconvolution.blend(deconvolution.solutions(projected, in_tiles(deconvolution, ratio, factors)))
+        least = border_noise_to_signal(deconvolution, left, blurred.longest_px / scale)
+        filtered = deconvolution.blend(deconvolution.solutions(projected, in_tiles(ratio, least, factors)))
         yield cv2.add(filtered, cv2.multiply(slope, sharp))
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
+from itertools import repeat
 
 import cv2
 import numpy as np
@@ -35,7 +36,7 @@ columns of the grid on which the kernels' variation is evaluated."""
 OVERLAP_GIVE = 0.1
 """Wide overlaps may be narrower by this fraction, if fewer tiles then cover the picture."""
 BORDER_NOISE_TO_SIGNAL = 0.003
-"""Least N / S of tiles that reach beyond the picture."""
+"""Least N / S of tiles that reach beyond the picture, where its border has no more contrast than the picture."""
 UNEVEN_NOISE_TO_SIGNAL = 0.03
 """Least N / S of a picture whose power lies at few frequencies: errors of the kernel or of a tile's surroundings are
 proportional to the power there, and exceed the noise."""
@@ -129,29 +130,56 @@ def noise_to_signal(
     settings: RestorationSettings,
     statistics: PictureStatistics,
     scale: float = 1.0,
-) -> tuple[Image, Image]:
-    """Measured N / S on a tile's packed spectrum: for tiles inside the picture, and for those that reach beyond it."""
+) -> Image:
+    """Measured N / S on a tile's packed spectrum."""
     ratio = on_spectrum(statistics, settings.strength**2 * statistics.noise_to_signal, deconvolution.size, scale)
-    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL)
     if statistics.unevenness:
         least = np.float32(UNEVEN_NOISE_TO_SIGNAL * statistics.unevenness)
-        ratio, guarded, mean = np.maximum(ratio, least), np.maximum(guarded, least), ratio[0, 0]
+        mean = ratio[0, 0]
+        ratio = np.maximum(ratio, least)
         ratio[0, 0] = mean
-    guarded[0, 0] = ratio[0, 0]
-    return ratio, guarded
+    return ratio
 
 
-def in_tiles(deconvolution: tiles.TileDeconvolution, ratio: Image, factors: Sequence[float]) -> Iterator[Image]:
-    """N / S of each tile, ``factors`` times the picture's; at least the border's in tiles that see beyond it.
+def border_noise_to_signal(deconvolution: tiles.TileDeconvolution, light: Image, reach_px: float) -> list[float]:
+    """Least N / S of each tile: 0 inside the picture, more the more its part of the picture's border varies.
 
-    Good until the next.
+    A tile that reaches beyond the picture assumes that the outermost pixels continue.  The error of that guess is
+    proportional to the contrast there: where a lamp enters a dark picture, its blur begins within a pixel and never
+    ends, and the inverse of the blur carries a comb of dark and bright spots far inwards.  light: (height, width).
+    reach_px: how far inwards blur brings what lies outside.
     """
-    own, least = np.empty((2, *ratio.shape), np.float32)
-    least[:] = BORDER_NOISE_TO_SIGNAL
-    least[0, 0] = 0.0  # the mean is no noise
-    for factor, border in zip(factors, deconvolution.at_border, strict=True):
-        cv2.multiply(ratio, factor, own)
-        yield cv2.max(own, least, own) if border else own
+    grid, margin, reach = deconvolution.grid, deconvolution.margin, max(round(reach_px), 4)
+    height, width = light.shape
+    seen, at_border = [], []
+    for top, left in grid.corners():
+        rows = slice(max(top - margin, 0), min(top + grid.side + margin, height))
+        columns = slice(max(left - margin, 0), min(left + grid.side + margin, width))
+        tile = light[rows, columns]
+        strips = [tile[:reach]] * (top < margin) + [tile[-reach:]] * (top + grid.side > height - margin)
+        strips += [tile[:, :reach]] * (left < margin) + [tile[:, -reach:]] * (left + grid.side > width - margin)
+        seen.append(_variance(tile))
+        at_border.append(max(map(_variance, strips), default=None))
+    mean = max(float(np.mean(seen)), 1e-12)
+    return [0.0 if v is None else BORDER_NOISE_TO_SIGNAL * max(1.0, v / mean) for v in at_border]
+
+
+def _variance(light: Image) -> float:
+    return float(cv2.meanStdDev(light)[1][0, 0]) ** 2
+
+
+def in_tiles(ratio: Image, least: Sequence[float], factors: Iterable[float] | None = None) -> Iterator[Image]:
+    """N / S of each tile: ``factors`` times the picture's, and at least ``least``.
+
+    factors: None: 1.  A ratio is valid until the next.
+    """
+    own, mean = np.empty_like(ratio), ratio[0, 0]
+    for lowest, factor in zip(least, repeat(1.0) if factors is None else factors, strict=False):
+        scaled = ratio if factor == 1.0 else cv2.multiply(ratio, factor, own)
+        if lowest:
+            scaled = cv2.max(scaled, lowest, own)
+            scaled[0, 0] = factor * mean  # the mean is no noise
+        yield scaled
 
 
 def join_neighbours(

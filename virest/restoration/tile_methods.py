@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -19,12 +19,13 @@ from virest.restoration.settings import FEW_ITERATIONS, RestorationSettings
 from virest.restoration.statistics.on_tiles import on_spectrum
 from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.tile_layout import (
-    BORDER_NOISE_TO_SIGNAL,
     FULL_MARGIN,
     THIN_MARGIN,
     THINNEST_MARGIN,
     UNEVEN_NOISE_TO_SIGNAL,
     Surroundings,
+    border_noise_to_signal,
+    in_tiles,
     join_neighbours,
     luma_tiles,
     noise_to_signal,
@@ -47,15 +48,16 @@ def by_tile_filter(blurred: BlurredPicture, settings: RestorationSettings) -> Ro
     """Luma by one linear filter per tile."""
     deconvolution = luma_tiles(blurred, settings)
     projected = _projected_luma(blurred, deconvolution, settings)
-    factors = _tile_factors(deconvolution, settings, blurred.statistics)
+    factors = _tile_factors(blurred, deconvolution, settings)
     sharp = deconvolution.blend(cv2.multiply(s, f) for s, f in zip(projected, factors, strict=True))
     return with_colour(blurred, deconvolution.restore_highlights(sharp), settings)
 
 
 def _tile_factors(
-    deconvolution: tiles.TileDeconvolution, settings: RestorationSettings, statistics: PictureStatistics
+    blurred: BlurredPicture, deconvolution: tiles.TileDeconvolution, settings: RestorationSettings
 ) -> Iterator[Image]:
     """Each tile's factor after conj(K) for the method in the settings; by default Wiener with the measured N / S."""
+    statistics = blurred.statistics
     match settings.deblur:
         case "inverse":
             return deconvolution.filters(tiles.inverse_filter)
@@ -65,10 +67,9 @@ def _tile_factors(
             ratio = np.full((deconvolution.size,) * 2, settings.strength**2 * flat, np.float32)
             ratio[0, 0] = 0.0  # keep the mean unchanged
             return deconvolution.filters(lambda power: tiles.wiener_filter(power, ratio))
-    ratio, guarded = noise_to_signal(deconvolution, settings, statistics.between_rings_and_level)
-    return deconvolution.filters(
-        lambda power: tiles.wiener_filter(power, ratio), lambda power: tiles.wiener_filter(power, guarded)
-    )
+    ratio = noise_to_signal(deconvolution, settings, statistics.between_rings_and_level)
+    least = border_noise_to_signal(deconvolution, luma_of(blurred.light), blurred.longest_px)
+    return map(tiles.wiener_filter, deconvolution.powers, in_tiles(ratio, least))
 
 
 def _projected_luma(
@@ -81,7 +82,7 @@ def _projected_luma(
         kernels = blurred.field(deconvolution.grid.centres_px[numbers]).arrays(positive=True)
         deconvolution.remove_highlights(numbers, kernels, luma, measured_part(holes), float(luma.max()))
     if blurred.neighbours:
-        ratio = noise_to_signal(deconvolution, settings, blurred.statistics)[0]
+        ratio = noise_to_signal(deconvolution, settings, blurred.statistics)
         join_neighbours(blurred, deconvolution, [luma], lambda neighbour: [neighbour.light], ratio)
     return deconvolution.back_projected(luma)
 
@@ -113,24 +114,24 @@ def tile_hyper_laplacian(
     deconvolution = luma_tiles(blurred, settings, around)
     statistics, few = blurred.statistics, settings.iterations <= FEW_ITERATIONS
     unit = statistics.gradient_scale * (FEW_SCALE if few else 1.0)
-    noise = settings.strength * np.array([statistics.noise_levels, _border_noise(blurred)])
-    trust, guarded = (float(t) for t in (unit / noise) ** 2)
+    least = border_noise_to_signal(deconvolution, luma_of(blurred.light), blurred.longest_px)
+    trusts = [(unit / (settings.strength * noise)) ** 2 for noise in _tile_noise(blurred, least)]
     gradients = tiles.gradient_power(deconvolution.size)
     projected = _projected_luma(blurred, deconvolution, settings)
     start = statistics.between_rings_and_level if few else statistics
-    ratios = noise_to_signal(deconvolution, settings, start)
-    linear = sharp = deconvolution.blend(deconvolution.solutions(projected, deconvolution.inside_or_at_border(*ratios)))
+    ratio = noise_to_signal(deconvolution, settings, start)
+    linear = sharp = deconvolution.blend(deconvolution.solutions(projected, in_tiles(ratio, least)))
     extra_noise = _extra_noise(statistics, deconvolution.size)
     before, scale = sharp, blurred.slopes(1, settings.tile_px, sharp.shape[::-1]) * np.float32(1.0 / unit)
     betas = beta_schedule(settings.iterations)
     for step, beta in enumerate(betas):
         ahead, before = _extrapolated(sharp, before, step), sharp
         pull = _gradient_targets(ahead, scale, shrinkage_levels(beta))
-        pulled = deconvolution.pulled(projected, pull, beta / trust, beta / guarded)
-        inner, at_border = (gradients * np.float32(beta / t) + extra_noise for t in (trust, guarded))
-        solved = deconvolution.solutions(pulled, deconvolution.inside_or_at_border(inner, at_border))
+        pulled = deconvolution.pulled(projected, pull, [beta / trust for trust in trusts])
+        priors = {trust: gradients * np.float32(beta / trust) + extra_noise for trust in set(trusts)}
+        solved = deconvolution.solutions(pulled, (priors[trust] for trust in trusts))
         if step == len(betas) - 1 and not few:
-            solved = _with_residual(deconvolution, projected, solved, statistics)
+            solved = _with_residual(deconvolution, projected, solved, statistics, least)
         sharp = deconvolution.blend(solved)
     share = max(LINEAR_SHARE * statistics.unevenness, statistics.below_noise if few else 0.0)
     if share:
@@ -159,31 +160,35 @@ def _extrapolated(sharp: Image, before: Image, step: int) -> Image:
     return cv2.addWeighted(sharp, 1 + momentum, before, -momentum, 0.0) if momentum else sharp
 
 
-def _border_noise(blurred: BlurredPicture) -> float:
-    """Noise, grey levels, to assume where tiles reach beyond the picture, whose content there is a rough guess.
+def _tile_noise(blurred: BlurredPicture, least: Sequence[float]) -> list[float]:
+    """Noise, grey levels, to assume in each tile.
 
-    A weakly regularised inverse would carry the guess's error many blur lengths inwards.
+    least: of :func:`border_noise_to_signal`.  Where a tile reaches beyond the picture, whose content there is a rough
+    guess, a weakly regularised inverse would carry the guess's error many blur lengths inwards.
     """
     statistics = blurred.statistics
     power = np.interp(2.0 / max(blurred.longest_px, 4.0), statistics.frequency, statistics.signal)
-    return max(statistics.noise_levels, float(np.sqrt(BORDER_NOISE_TO_SIGNAL * power)))
+    return [max(statistics.noise_levels, float(np.sqrt(ratio * power))) for ratio in least]
 
 
 def _with_residual(
-    deconvolution: tiles.TileDeconvolution, projected: Image, solved: Iterable[Image], statistics: PictureStatistics
+    deconvolution: tiles.TileDeconvolution,
+    projected: Image,
+    solved: Iterable[Image],
+    statistics: PictureStatistics,
+    least: Sequence[float],
 ) -> Iterator[Image]:
     """Each tile's spectrum with the fine texture added that the prior removed as noise.
 
-    That is the residual g − K f, filtered as a picture of little power.  A spectrum is valid until the next.
+    That is the residual g − K f, filtered as a picture of little power.  least: N / S of each tile.  A spectrum is
+    valid until the next.
     """
     ratio = on_spectrum(statistics, statistics.noise_to_signal / RESIDUAL_SHARE, deconvolution.size)
-    guarded = np.maximum(ratio, BORDER_NOISE_TO_SIGNAL / RESIDUAL_SHARE)
     left, divisor = np.empty((2, *ratio.shape), np.float32)
-    for spectrum, back, power, border in zip(
-        solved, projected, deconvolution.powers, deconvolution.at_border, strict=True
-    ):
+    ratios = in_tiles(ratio, [lowest / RESIDUAL_SHARE for lowest in least])
+    for spectrum, back, power, own in zip(solved, projected, deconvolution.powers, ratios, strict=True):
         cv2.subtract(back, cv2.multiply(power, spectrum, left), left)
-        cv2.divide(left, cv2.add(power, guarded if border else ratio, divisor), left)
+        cv2.divide(left, cv2.add(power, own, divisor), left)
         yield cv2.add(spectrum, left, left)
 
 

@@ -79,13 +79,6 @@ class TileDeconvolution:
         self.margin = margin
         self.patch = grid.side + 2 * margin
         self.size = fast_size(self.patch + (margin if bridge is None else bridge))
-        self.at_border = [
-            top < margin
-            or left < margin
-            or top + grid.side > grid.height - margin
-            or left + grid.side > grid.width - margin
-            for top, left in grid.corners()
-        ]
         self._windows = grid.windows()
         self._bridge = _bridge(self.size - self.patch)
         self._tile, self._spectrum, self._divisor = np.empty((3, self.size, self.size), np.float32)
@@ -107,10 +100,9 @@ class TileDeconvolution:
         self._highlights: dict[int, tuple[Image, Image]] = {}
         """By tile number: weight of the Richardson–Lucy solution and its weighted light, (side, side) each."""
 
-    def filters(self, make: Filter, at_border: Filter | None = None) -> Iterator[Image]:
-        """The packed real factor of each tile; ``at_border`` makes it for tiles that reach beyond the picture."""
-        for power, border in zip(self.powers, self.at_border, strict=True):
-            yield (at_border or make)(power) if border else make(power)
+    def filters(self, make: Filter) -> Iterator[Image]:
+        """The packed real factor of each tile."""
+        return map(make, self.powers)
 
     def back_projected(self, channel: Image, number_joined: int = 0) -> Image:
         """Spectra of Kᵀ g, (tiles, size, size); channel (height, width) is extended by replication, never wrapped.
@@ -243,10 +235,6 @@ class TileDeconvolution:
         shares, highlights = (whole[: grid.height, : grid.width] for whole in (shares, highlights))
         return cv2.add(cv2.subtract(picture, cv2.multiply(picture, shares)), highlights)
 
-    def inside_or_at_border(self, inner: Image, at_border: Image) -> Iterator[Image]:
-        """One of the two for each tile: the second for those that see beyond the picture."""
-        return (at_border if border else inner for border in self.at_border)
-
     def solutions(self, projected: Iterable[Image], regularisations: Iterable[Image]) -> Iterator[Image]:
         """Each tile's spectrum over |K|² + R, with its own regularisation R.
 
@@ -256,18 +244,17 @@ class TileDeconvolution:
         for spectrum, power, regularisation in zip(projected, self.powers, regularisations, strict=True):
             yield cv2.divide(spectrum, cv2.add(power, regularisation, divisor), divisor)
 
-    def pulled(self, projected: Iterable[Image], pull: Image, inner: float, at_border: float) -> Iterator[Image]:
-        """Each tile's spectrum plus a factor times that of ``pull`` (height, width).
+    def pulled(self, projected: Iterable[Image], pull: Image, factors: Iterable[float]) -> Iterator[Image]:
+        """Each tile's spectrum plus its factor times that of ``pull`` (height, width).
 
-        The factor is ``inner`` or ``at_border``.  Beyond the picture's edges and on the bridges ``pull`` counts as 0:
-        there the solution is a guess anyway.
+        Beyond the picture's edges and on the bridges ``pull`` counts as 0: there the solution is a guess anyway.
         """
         padded, patch = self.padded(pull, cv2.BORDER_CONSTANT), self.patch
         tile, spectrum = np.zeros_like(self._tile), self._spectrum
-        for (top, left), back, border in zip(self.grid.corners(), projected, self.at_border, strict=True):
+        for (top, left), back, factor in zip(self.grid.corners(), projected, factors, strict=True):
             tile[:patch, :patch] = padded[top : top + patch, left : left + patch]
             transforms.forward(tile, spectrum)
-            yield cv2.scaleAdd(spectrum, at_border if border else inner, back, spectrum)
+            yield cv2.scaleAdd(spectrum, factor, back, spectrum)
 
     def blend(self, spectra: Iterable[Image]) -> Image:
         """Transform tiles back and blend them, weighted by the windows, into one picture (height, width)."""
