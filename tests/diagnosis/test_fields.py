@@ -250,10 +250,9 @@ def test_a_bias_measured_at_rest_stays_with_a_sensitivity_to_gravity() -> None:
     assert np.corrcoef(sensitivity.ravel(), -PER_FORCE.T.ravel())[0, 1] > 0.95
 
 
-@pytest.mark.parametrize(("seed", "sway_m"), [(101, 0.1), (102, 0.25)], ids=["shaken", "at_4_g"])
-def test_a_wrong_focal_length_beside_a_sensitivity_to_gravity_is_named(seed: int, sway_m: float) -> None:
+def test_a_wrong_focal_length_beside_a_sensitivity_to_gravity_is_named() -> None:
     """The focal length is named rather than a focal drift, and forces up to 4 g are used."""
-    wall = replace(HAND, seed=seed, sway_m=sway_m, plane_per_m=(0.05, -0.1, 0.35), accel_bias_m_s2=(0.0, 0.0, 0.0))
+    wall = replace(HAND, seed=102, sway_m=0.25, plane_per_m=(0.05, -0.1, 0.35), accel_bias_m_s2=(0.0, 0.0, 0.0))
     phone = StrangePhone(wall, Strange(gyro=lambda t, reading, force: reading + force @ (0.6 * PER_FORCE).T))
     lens = phone.profile.intrinsics
     assert lens is not None
