@@ -62,7 +62,9 @@ def diagnosis(source: diagnose.Source, verdict: str, causes: tuple[Finding, ...]
         Rung("time_offset", tried, 1.4, "geometry_rms_px"),
         Rung(None, {"gyro_bias": 0.23}, 0.22, "geometry_rms_px"),
     )
-    left = Remaining(0.4, "radius", 0.01, "geometry_rms_px", verdict == "unexplained", "something goes on along radius")
+    left = Remaining(
+        0.4, "radius", 0.01, 0.05, "geometry_rms_px", verdict == "unexplained", "something goes on along radius"
+    )
     return Diagnosis(
         verdict, Nominal(1.4, 0.2, None, float("nan"), 1234, 24), causes, left, nominal, extended, rungs,
         {"before": some, "after": some}, ("blur was not judged: too little of it",),

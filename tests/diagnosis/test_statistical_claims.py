@@ -94,3 +94,6 @@ def test_residual_texts_are_plausible() -> None:
     assert residual_words(0.399, 0.123) == "0.399 px (tracking noise 0.123 px)"
     assert residual_words(0.05, 0.763) == "0.05 px, no more than tracking noise (0.763 px)"
     assert "p unknown" in remaining_words({"p_value": None, "strongest_along": "place"}, "unexplained")
+    small = {"p_value": 2e-34, "strongest_along": "time", "size": 0.12, "limit": 0.17, "unit": "px"}
+    assert remaining_words(small, "explained").startswith("What remains, 0.12 px along time, is below the 0.17")
+    assert "p = 0.3" in remaining_words({**small, "p_value": 0.3, "size": 0.2}, "explained")

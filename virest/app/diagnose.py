@@ -212,6 +212,9 @@ def as_json(found: Diagnosis, gain: RestorationGain, figures: Sequence[Sequence[
         "unexplained": {
             "p_value": found.unexplained.p_value,
             "strongest_along": found.unexplained.strongest_along,
+            "size": found.unexplained.size,
+            "limit": found.unexplained.limit,
+            "unit": found.unexplained.unit,
         },
         "restoration_gain": dataclasses.asdict(gain),
         "extended_profile": EXTENDED,

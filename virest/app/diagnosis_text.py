@@ -90,8 +90,7 @@ def _gain_line(gain: RestorationGain) -> str:
 def _remaining_line(left: Remaining) -> str:
     if left.significant:
         return f"unexplained: {_one_line(left.sentence) or f'{_number(left.size)} along {left.strongest_along}'}"
-    unit = "px" if left.quantity.endswith("_px") else "levels"
-    return f"no significant residual: {_number(left.size)} {unit} along {left.strongest_along}"
+    return f"no significant residual: {_number(left.size)} {left.unit} along {left.strongest_along}"
 
 
 def _one_line(text: str) -> str:

@@ -136,10 +136,17 @@ class Remaining:
     strongest_along: str
     """``row``, ``time``, ``radius``, ``rate``, ``brightness`` ..."""
     size: float
-    """rms of the structure, in the units of ``quantity``."""
+    """rms of the structure, in ``unit``."""
+    limit: float
+    """Smaller structure is not held against the model, however small ``p_value`` is: trackers and encoders leave it."""
     quantity: str
     significant: bool
     sentence: str = ""
+
+    @property
+    def unit(self) -> str:
+        """Of ``size`` and ``limit``."""
+        return "px" if self.quantity.endswith("_px") else "grey levels"
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,15 +72,15 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
         log.debug("without the tracker's bias between differently blurred frames: %s", found)
     if strongest.size > limit and strongest.p_value < STRUCTURE_P:
         sentence = f"residual {strongest.size:.3f} px, strongest along {strongest.along}"
-        return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, True, sentence)
+        return Remaining(strongest.p_value, strongest.along, strongest.size, limit, GEOMETRY, True, sentence)
     if noisier:
         sentence = f"residual {beyond:.3f} px beyond tracking noise, strongest along {strongest.along}"
-        return Remaining(p_noisier, strongest.along, beyond, GEOMETRY, True, sentence)
+        return Remaining(p_noisier, strongest.along, beyond, STRUCTURE_PX, GEOMETRY, True, sentence)
     if strays:
         sentence = f"{stray:.0%} of the points move on their own"
         p_value = None if geometric.independent_share > STRAY_PART else p_stray
-        return Remaining(p_value, "place", strongest.size, GEOMETRY, True, sentence)
-    return Remaining(strongest.p_value, strongest.along, strongest.size, GEOMETRY, False)
+        return Remaining(p_value, "place", strongest.size, limit, GEOMETRY, True, sentence)
+    return Remaining(strongest.p_value, strongest.along, strongest.size, limit, GEOMETRY, False)
 
 
 def _point_structures(
@@ -169,7 +169,8 @@ def _light_left(photometric: picture_ladder.PictureVerdict) -> Remaining:
     log.debug("light left: %s", found)
     significant = strongest.size > PHOTOMETRIC_STRUCTURE and strongest.p_value < STRUCTURE_P
     sentence = f"residual {strongest.size:.1f} grey levels, strongest along {strongest.along}" if significant else ""
-    return Remaining(strongest.p_value, strongest.along, strongest.size, PHOTOMETRY, significant, sentence)
+    size, limit = strongest.size, PHOTOMETRIC_STRUCTURE
+    return Remaining(strongest.p_value, strongest.along, size, limit, PHOTOMETRY, significant, sentence)
 
 
 def residuals(geometric: GeometricVerdict, nominal: bool) -> dict[str, Array]:

@@ -223,12 +223,20 @@ def _part(after: Any, before: Any) -> float | None:
 
 
 def remaining_words(unexplained: Mapped, verdict: str) -> str:
-    """The residual that no cause explains, in a sentence."""
+    """The residual that no cause explains, in a sentence.
+
+    One that is too small to matter may have any p value: with enough points everything is significant.
+    """
     along = str(unexplained.get("strongest_along") or "nothing in particular")
-    value = unexplained.get("p_value")
+    value, size, limit = (unexplained.get(key) for key in ("p_value", "size", "limit"))
     p_value = "p unknown" if value is None else f"p = {number(value, 2)}"
     if verdict == "unexplained":
         return f"The remaining residual is significant ({p_value}), strongest along {along}."
+    if size is not None and limit is not None and size <= limit:
+        sizes = f"{number(size, 2)} {unexplained.get('unit', '')}".rstrip()
+        return (
+            f"What remains, {sizes} along {along}, is below the {number(limit, 2)} that count as an error of the model."
+        )
     return f"No significant residual ({p_value}, strongest along {along})."
 
 
