@@ -62,9 +62,8 @@ def diagnosis(source: diagnose.Source, verdict: str, causes: tuple[Finding, ...]
         Rung("time_offset", tried, 1.4, "geometry_rms_px"),
         Rung(None, {"gyro_bias": 0.23}, 0.22, "geometry_rms_px"),
     )
-    left = Remaining(
-        0.4, "radius", 0.01, 0.05, "geometry_rms_px", verdict == "unexplained", "something goes on along radius"
-    )
+    said = "something goes on along radius"
+    left = Remaining(0.4, "radius", 0.01, 0.05, "geometry_rms_px", verdict == "unexplained", said)
     return Diagnosis(
         verdict, Nominal(1.4, 0.2, None, float("nan"), 1234, 24), causes, left, nominal, extended, rungs,
         {"before": some, "after": some}, ("blur was not judged: too little of it",),
@@ -123,7 +122,7 @@ def test_diagnosis_json_has_exactly_the_documented_keys(tiny: Path, tmp_path: Pa
     assert facts["schema"] == "virest/diagnosis/1"
     assert set(facts["nominal"]) == NOMINAL_KEYS
     assert facts["nominal"]["photometric_rms"] is None is facts["nominal"]["blur_rms_px"]
-    assert set(facts["unexplained"]) == {"p_value", "strongest_along"}
+    assert set(facts["unexplained"]) == {"p_value", "strongest_along", "size", "limit", "unit"}
     assert {"sharpness_before", "sharpness_after"} <= set(facts["restoration_gain"])
     first, second = facts["causes"]
     assert set(first) == set(second) == CAUSE_KEYS

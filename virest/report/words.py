@@ -234,9 +234,7 @@ def remaining_words(unexplained: Mapped, verdict: str) -> str:
         return f"The remaining residual is significant ({p_value}), strongest along {along}."
     if size is not None and limit is not None and size <= limit:
         sizes = f"{number(size, 2)} {unexplained.get('unit', '')}".rstrip()
-        return (
-            f"What remains, {sizes} along {along}, is below the {number(limit, 2)} that count as an error of the model."
-        )
+        return f"What remains, {sizes} along {along}, is below the {number(limit, 2)} that count as a model error."
     return f"No significant residual ({p_value}, strongest along {along})."
 
 
