@@ -17,6 +17,7 @@ from virest.inference.blur_bias import RELATIVE_STD, blur_bias_px
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.robust import cauchy_weight, robust_std
 from virest.inference.track_fit import TrackFit
+from virest.motion.measured_rate import noise_density
 
 log = logging.getLogger(__name__)
 
@@ -60,9 +61,10 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     strongest = max(found, key=lambda s: s.size)
     stray = max(float(np.mean(fitted.distance > STRAY_DISTANCE * max(fitted.scale, 1.0))), geometric.independent_share)
     limit = max(STRUCTURE_PX, STRUCTURE_NOISES * noise)
-    beyond = float(np.sqrt(max(geometric.final_rms_px**2 - noise**2, 0.0)))
-    p_noisier, p_stray = _more_than_noise(fitted.distance, table.pair, noise / geometric.step_noise_px)
-    noisier = beyond > STRUCTURE_PX and geometric.final_rms_px > SCALE_EXCESS * noise and p_noisier < STRUCTURE_P
+    all_noise = float(np.hypot(noise, np.sqrt(np.mean(_turned_by_noise_px(fitted, table) ** 2))))
+    beyond = float(np.sqrt(max(geometric.final_rms_px**2 - all_noise**2, 0.0)))
+    p_noisier, p_stray = _more_than_noise(fitted.distance, table.pair, all_noise / geometric.step_noise_px)
+    noisier = beyond > STRUCTURE_PX and geometric.final_rms_px > SCALE_EXCESS * all_noise and p_noisier < STRUCTURE_P
     strays = geometric.independent_share > STRAY_PART or (stray > STRAY_PART and p_stray < STRUCTURE_P)
     log.debug("left: %s, limit %.3f, beyond noise %.3f, stray %.3f", found, limit, beyond, stray)
     if strongest.size > limit and strongest.p_value < STRUCTURE_P and geometric.evidence is not None:
@@ -97,7 +99,17 @@ def _point_structures(
     radial = (left_px * outwards).sum(axis=-1)
     difference = np.concatenate([left_px, radial[:, None]], axis=-1)
     found = structures(difference, fitted.weight, covariates, table.pair, TRACKING_BIAS_PX)
-    return [*found, _along_time(left_px, fitted.weight, table.pair, uncertain_px)]
+    turned_px = _turned_by_noise_px(fitted, table)
+    return [*found, _along_time(left_px, fitted.weight, table.pair, turned_px, uncertain_px)]
+
+
+def _turned_by_noise_px(fitted: TrackFit, table: TrackTable) -> Array:
+    """(pairs,) standard deviation, per axis, of a pair's shift by the gyroscope's white noise between its frames."""
+    lens = fitted.profile.intrinsics
+    assert lens is not None
+    apart_s = np.abs(table.second_stamp_s - table.first_stamp_s)
+    pair_s = np.bincount(table.pair, apart_s) / np.maximum(np.bincount(table.pair), 1)
+    return np.asarray(lens.fx_px * noise_density(fitted.integrated.measured.gyro) * np.sqrt(pair_s))
 
 
 def _from_centre_px(fitted: TrackFit, table: TrackTable) -> Array:
@@ -136,10 +148,11 @@ def _more_than_noise(distance: Array, pair: Index, noise: float) -> tuple[float,
     return first, second
 
 
-def _along_time(difference: Array, weight: Array, pair: Index, shared: Array | None = None) -> Structure:
+def _along_time(difference: Array, weight: Array, pair: Index, turned: Array, shared: Array | None = None) -> Structure:
     """Structure over time: scatter of the pairs' mean residuals in excess of what the scatter of their points gives.
 
-    shared: (n, 2) standard deviation of an error with the same sign in all points of a pair.
+    turned: (pairs,) standard deviation of a pair's mean residual by the gyroscope's noise.  shared: (n, 2) of an error
+    with the same sign in all points of a pair.
     """
     total = np.maximum(np.bincount(pair, weight), 1e-9)
     excess, chi2, freedom = 0.0, 0.0, 0
@@ -149,7 +162,7 @@ def _along_time(difference: Array, weight: Array, pair: Index, shared: Array | N
         variance = np.bincount(pair, (weight * (column - mean[pair])) ** 2) / total**2
         used = np.bincount(pair) > LEAST_IN_PAIR
         common = np.bincount(pair, weight * error) / total
-        spread = 2 * variance[used] + TRACKING_BIAS_PX**2 + common[used] ** 2
+        spread = 2 * variance[used] + TRACKING_BIAS_PX**2 + common[used] ** 2 + turned[used] ** 2
         excess += float(np.mean(np.maximum(mean[used] ** 2 - spread, 0.0)))
         chi2 += float(np.sum(mean[used] ** 2 / spread))
         freedom += int(used.sum())

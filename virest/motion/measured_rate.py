@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy import signal
 from scipy.fft import dct, idct
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
@@ -33,6 +34,13 @@ NOISE_BAND = 0.75
 """Above this fraction of the band there is only noise: 75 Hz at 200 samples/s, while hand shake ends at 15 Hz."""
 BAND_PART = 40
 """The power at a frequency is the mean over 1 / this of the band: about 30 values in 3 s at 400 samples/s."""
+WHITE_BAND_HZ = (20.0, 45.0)
+"""Frequencies of white noise alone: above those of hand shake, and below those that a phone's own low pass weakens."""
+MOST_WEAKENED = 3.0
+"""How many times that low pass weakens noise at the end of the band: one of 60 Hz at 100 Hz.  What exceeds it below is
+vibration, as in a car, and no noise."""
+WHITE_WINDOW_S = 1.0
+"""Length of the windows in which it is measured; they confine a hand's motion to its own frequencies by 92 dB."""
 FALSE_ALARM = 1e-3
 """Probability that samples of pure noise have significant power anywhere in the band."""
 
@@ -78,6 +86,30 @@ def measured_rate(imu: ImuSamples) -> MeasuredRate:
     if len(imu) < 2:
         raise ImuError(f"{len(imu)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
     return MeasuredRate(imu.time_s, imu.gyro_rad_s, _pieces(imu.time_s, imu.gyro_rad_s))
+
+
+def noise_density(measured: MeasuredRate) -> float:
+    """Density of the rate's white noise, rad/s/√Hz, the mean power of the three axes; 0 for too few samples.
+
+    A rotation integrated over T has a standard deviation of √T times that.  Unlike differences of adjacent samples, it
+    holds for a gyroscope with a low-pass filter.
+    """
+    densities, weights = [], []
+    for run in _runs(measured.time_s):
+        if len(run) < LEAST_RUN:
+            continue
+        per_s = 1 / float(np.median(np.diff(measured.time_s[run])))
+        frequency_hz, power = signal.welch(
+            measured.rate_rad_s[run], per_s, "blackmanharris", min(len(run), round(WHITE_WINDOW_S * per_s)),
+            detrend="linear", axis=0, average="median",
+        )  # fmt: skip
+        inside = (frequency_hz > WHITE_BAND_HZ[0]) & (frequency_hz < WHITE_BAND_HZ[1])
+        above = frequency_hz > NOISE_BAND * frequency_hz[-1]
+        if inside.any():
+            one_sided = min(power[inside].mean(), MOST_WEAKENED**2 * power[above].mean())
+            densities.append(0.5 * float(one_sided))
+            weights.append(len(run))
+    return float(np.sqrt(np.average(densities, weights=weights))) if densities else 0.0
 
 
 def without_noise(samples: Array) -> Array:

@@ -142,7 +142,7 @@ def noise_to_signal(
 
 
 def border_noise_to_signal(deconvolution: tiles.TileDeconvolution, light: Image, reach_px: float) -> list[float]:
-    """Least N / S of each tile: 0 inside the picture, more the more its part of the picture's border varies.
+    """Least N / S of each tile: 0 inside the picture, more where its part of the border varies more than all else does.
 
     A tile that reaches beyond the picture assumes that the outermost pixels continue.  The error of that guess is
     proportional to the contrast there: where a lamp enters a dark picture, its blur begins within a pixel and never
@@ -156,16 +156,21 @@ def border_noise_to_signal(deconvolution: tiles.TileDeconvolution, light: Image,
         rows = slice(max(top - margin, 0), min(top + grid.side + margin, height))
         columns = slice(max(left - margin, 0), min(left + grid.side + margin, width))
         tile = light[rows, columns]
-        strips = [tile[:reach]] * (top < margin) + [tile[-reach:]] * (top + grid.side > height - margin)
-        strips += [tile[:, :reach]] * (left < margin) + [tile[:, -reach:]] * (left + grid.side > width - margin)
+        beyond = (top < margin, top + grid.side > height - margin, left < margin, left + grid.side > width - margin)
+        above, below, before, after = (reach * outside for outside in beyond)
+        inside = tile[above : len(tile) - below, before : tile.shape[1] - after]
+        strips = [tile[:above], tile[len(tile) - below :], tile[:, :before], tile[:, tile.shape[1] - after :]]
         seen.append(_variance(tile))
-        at_border.append(max(map(_variance, strips), default=None))
-    mean = max(float(np.mean(seen)), 1e-12)
-    return [0.0 if v is None else BORDER_NOISE_TO_SIGNAL * max(1.0, v / mean) for v in at_border]
+        at_border.append((_variance(inside), max(map(_variance, strips))) if any(beyond) else None)
+    mean = float(np.mean(seen))
+    return [
+        0.0 if found is None else BORDER_NOISE_TO_SIGNAL * max(1.0, found[1] / max(mean, found[0], 1e-12))
+        for found in at_border
+    ]
 
 
 def _variance(light: Image) -> float:
-    return float(cv2.meanStdDev(light)[1][0, 0]) ** 2
+    return float(cv2.meanStdDev(light)[1][0, 0]) ** 2 if light.size else 0.0
 
 
 def in_tiles(ratio: Image, least: Sequence[float], factors: Iterable[float] | None = None) -> Iterator[Image]:
