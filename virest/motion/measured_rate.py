@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import signal
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import dct, idct
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
@@ -40,7 +40,9 @@ MOST_WEAKENED = 3.0
 """How many times that low pass weakens noise at the end of the band: one of 60 Hz at 100 Hz.  What exceeds it below is
 vibration, as in a car, and no noise."""
 WHITE_WINDOW_S = 1.0
-"""Length of the windows in which it is measured; they confine a hand's motion to its own frequencies by 92 dB."""
+"""Length of the windows in which it is measured."""
+BLACKMAN_HARRIS = np.array([0.35875, -0.48829, 0.14128, -0.01168])
+"""A window that keeps a hand's motion 92 dB out of other frequencies (Harris 1978, doi:10.1109/PROC.1978.10837)."""
 FALSE_ALARM = 1e-3
 """Probability that samples of pure noise have significant power anywhere in the band."""
 
@@ -98,18 +100,30 @@ def noise_density(measured: MeasuredRate) -> float:
     for run in _runs(measured.time_s):
         if len(run) < LEAST_RUN:
             continue
-        per_s = 1 / float(np.median(np.diff(measured.time_s[run])))
-        frequency_hz, power = signal.welch(
-            measured.rate_rad_s[run], per_s, "blackmanharris", min(len(run), round(WHITE_WINDOW_S * per_s)),
-            detrend="linear", axis=0, average="median",
-        )  # fmt: skip
+        step_s = float(np.median(np.diff(measured.time_s[run])))
+        frequency_hz, power = _power_density(measured.rate_rad_s[run], step_s)
         inside = (frequency_hz > WHITE_BAND_HZ[0]) & (frequency_hz < WHITE_BAND_HZ[1])
         above = frequency_hz > NOISE_BAND * frequency_hz[-1]
         if inside.any():
-            one_sided = min(power[inside].mean(), MOST_WEAKENED**2 * power[above].mean())
-            densities.append(0.5 * float(one_sided))
+            densities.append(min(power[inside].mean(), MOST_WEAKENED**2 * power[above].mean()))
             weights.append(len(run))
     return float(np.sqrt(np.average(densities, weights=weights))) if densities else 0.0
+
+
+def _power_density(samples: Array, step_s: float) -> tuple[Array, Array]:
+    """Frequencies, Hz, and the mean power per Hz, negative frequencies apart, of samples (n, k) in their windows.
+
+    Welch 1967 (doi:10.1109/TAU.1967.1161901): windows overlap by half, and a line is subtracted from each.
+    """
+    length = min(len(samples), round(WHITE_WINDOW_S / step_s))
+    parts = sliding_window_view(samples, length, axis=0)[:: max(length // 2, 1)]
+    line = np.linspace(-1.0, 1.0, length)
+    parts = parts - parts.mean(axis=-1, keepdims=True)
+    parts = parts - (parts @ line / (line @ line))[..., None] * line
+    angle = 2 * np.pi * np.arange(length) / length
+    window = BLACKMAN_HARRIS @ np.cos(np.arange(4)[:, None] * angle)
+    power = np.abs(np.fft.rfft(parts * window)) ** 2 * (step_s / (window @ window))
+    return np.asarray(np.fft.rfftfreq(length, step_s)), np.asarray(power.mean(axis=(0, 1)))
 
 
 def without_noise(samples: Array) -> Array:
