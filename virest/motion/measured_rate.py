@@ -93,8 +93,8 @@ def measured_rate(imu: ImuSamples) -> MeasuredRate:
 def noise_density(measured: MeasuredRate) -> float:
     """Density of the rate's white noise, rad/s/√Hz, the mean power of the three axes; 0 for too few samples.
 
-    A rotation integrated over T has a standard deviation of √T times that.  Unlike differences of adjacent samples, it
-    holds for a gyroscope with a low-pass filter.
+    A rotation integrated over T has a standard deviation of √T times that.  Unlike the differences of adjacent samples
+    that :func:`virest.camera.kalibr.measure_imu_noise` takes, it holds for a gyroscope with a low-pass filter.
     """
     densities, weights = [], []
     for run in _runs(measured.time_s):

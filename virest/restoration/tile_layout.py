@@ -38,8 +38,7 @@ OVERLAP_GIVE = 0.1
 BORDER_NOISE_TO_SIGNAL = 0.003
 """Least N / S of tiles that reach beyond the picture, where its border has no unusual contrast."""
 USUAL_CONTRAST = 2.0
-"""Contrast (standard deviation) along the border, over the picture's, by which parts of a scene differ without a lamp.
-"""
+"""Contrast (standard deviation) along the border, over the picture's, that parts of a scene reach without a lamp."""
 UNEVEN_NOISE_TO_SIGNAL = 0.03
 """Least N / S of a picture whose power lies at few frequencies: errors of the kernel or of a tile's surroundings are
 proportional to the power there, and exceed the noise."""
