@@ -12,7 +12,6 @@ from virest.camera.kalibr import (
     format_camchain,
     format_imu,
     is_kalibr,
-    measure_imu_noise,
     parse_camchain,
     parse_imu,
 )
@@ -204,24 +203,3 @@ def test_an_unknown_random_walk_gets_a_default_and_a_comment():
     assert content["gyroscope_random_walk"] > 0
     assert "not measured" in text
     assert "accelerometer_noise_density" not in content
-
-
-@pytest.mark.parametrize("rate_hz", [150.0, 400.0])
-def test_noise_is_measured_during_hand_motion(rng, rate_hz):
-    """White noise on rotations of up to 2 rad/s at 3 Hz is measured within 10 % at any sample rate."""
-    time_s = np.arange(int(30 * rate_hz)) / rate_hz
-    swing = np.exp(-((time_s - 11) ** 2) / 50)[:, None] * np.sin(2 * np.pi * 3 * time_s[:, None] + [0.0, 1.0, 2.0])
-    gyro = 2 * swing + rng.normal(0, 0.003, swing.shape)
-    accel = 3 * swing + [0, 9.8, 0] + rng.normal(0, 0.04, swing.shape)
-    found = measure_imu_noise(time_s, gyro, accel)
-    assert found.update_rate_hz == pytest.approx(rate_hz)
-    assert found.gyro_density == pytest.approx(0.003 / np.sqrt(rate_hz), rel=0.1)
-    assert found.accel_density == pytest.approx(0.04 / np.sqrt(rate_hz), rel=0.1)
-
-
-def test_unmeasurable_noise_is_unknown(rng):
-    """Too few samples give no result; without accelerometer its density is unknown."""
-    time_s = np.arange(400) / 200
-    gyro = rng.normal(0, 0.01, (400, 3))
-    assert measure_imu_noise(time_s[:20], gyro[:20], gyro[:20]) is None
-    assert measure_imu_noise(time_s, gyro, np.full((400, 3), np.nan)).accel_density is None

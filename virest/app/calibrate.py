@@ -16,11 +16,12 @@ from virest.app.outputs import output_error, require_no_input, require_writable,
 from virest.calibration.calibrated_values import CalibratedValue
 from virest.calibration.geometry import FRAME_LAG, GeometryCalibration, calibrate_geometry
 from virest.calibration.unfitted_parameters import OPTIONAL
-from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, measure_imu_noise, parse_imu
+from virest.camera.kalibr import ImuNoise, format_camchain, format_imu, is_kalibr, parse_imu
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import format_profile, profile_mapping
 from virest.camera.yaml_mapping import load_yaml_mapping
 from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.imu_noise import measure_imu_noise
 from virest.capture.records import Capture
 from virest.capture.video import GrayReader, probe_movie
 from virest.errors import CalibrationError, OutputError
@@ -181,7 +182,7 @@ def find_calibration(
 
     found = calibrate_geometry(plan.capture, plan.profile, pairs, plan.extra, lambda _stage: step(1), track_again)
     _require_offset(found)
-    noise = measure_imu_noise(plan.capture.imu.time_s, plan.capture.imu.gyro_rad_s, plan.capture.imu.accel_m_s2)
+    noise = measure_imu_noise(plan.capture.imu)
     return as_json(plan, found, noise), found, noise
 
 

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from virest.app.outputs import capture_name
 from virest.app.run_folder import RunFolder, read_lines
 from virest.arrays import Array
-from virest.camera.kalibr import ImuNoise, field_notes, measure_imu_noise
+from virest.camera.kalibr import ImuNoise, field_notes
 from virest.camera.lens_fit import standard_lens
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import parse_profile
 from virest.camera.recounting import counted_from, on_camera_clock
 from virest.capture.files import label, scan_text
 from virest.capture.folder import Capture, Frame, read_capture, require_folder, resolve_profile
+from virest.capture.imu_noise import measure_imu_noise
 from virest.capture.profile_source import for_capture, with_logged_focal
 from virest.capture.records import STALL
 from virest.errors import CaptureError, OutputError
@@ -152,7 +153,7 @@ def plan_export(path: str, options: ExportOptions) -> ExportPlan:
         profile=written,
         instant_s=instant_s,
         imu_time_ns=_imu_time_ns(capture, profile),
-        noise=measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2),
+        noise=measure_imu_noise(imu),
         source=source,
         notes=notes,
         camera=profile,

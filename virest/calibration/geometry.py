@@ -30,9 +30,9 @@ from virest.calibration.calibrated_values import (
     without_readout,
 )
 from virest.calibration.unfitted_parameters import OPTIONAL, HeldValue, held_notes, held_values
-from virest.camera.kalibr import measure_imu_noise
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.capture.imu_noise import noise_density
 from virest.capture.records import Capture
 from virest.effects.changes import keep_readout
 from virest.errors import CalibrationError
@@ -522,8 +522,7 @@ def _mistaken_rotation(joint: _Joint, coarse: CoarseAlignment) -> tuple[float, f
 
 def _gyro_mean_std_rad_s(imu: ImuSamples, span_s: float) -> float:
     """Standard deviation of the gyroscope's mean white noise over a time, which is indistinguishable from a bias."""
-    noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
-    return (noise.gyro_density or 0.0) / max(span_s, 0.1) ** 0.5 if noise else 0.0
+    return (noise_density(imu.time_s, imu.gyro_rad_s) or 0.0) / max(span_s, 0.1) ** 0.5
 
 
 def _translation(fit: TrackFit) -> str:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from virest.arrays import Array
 from virest.camera.lens_fit import standard_lens
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.profile_file import parse_profile
@@ -29,18 +28,6 @@ _DISTORTIONS = {
 DEFAULT_TOPIC = "/imu0"
 USUAL_GYRO_WALK, USUAL_ACCEL_WALK = 2.2e-6, 8.6e-5
 """Random walks of a phone's inertial sensor (BMI160, Schubert et al., IROS 2018), rad/s²/√Hz and m/s³/√Hz."""
-NOISE_WINDOW = 32
-"""Samples per window; windows with the least motion are used."""
-STILLEST_PART = 0.25
-"""Share of the windows that are used.  Densities of 5 s at 200 Hz scatter by 6 %; of half as many windows by 10 %, of
-twice as many by 5 %."""
-MIN_NOISE_SAMPLES = 2 * NOISE_WINDOW
-"""Two windows are the fewest to choose from."""
-DIFFERENCE_ORDER, DIFFERENCE_GAIN = 5, 252.0
-"""Variance gain of the fifth difference for white noise: 1 + 25 + 100 + 100 + 25 + 1.  A tremor of 12 Hz sampled at
-200 Hz passes with 1/2000 of its amplitude; with a lower order as much of it would pass as there is noise."""
-NORMAL_MEDIAN = 0.6745
-"""Median of |x| for a standard normal x."""
 WALK_COMMENT = "not measured (that takes hours at rest): typical for phones"
 
 
@@ -301,35 +288,3 @@ def _not_held(
     if replace(profile.extensions, field=()) != Extensions():
         notes.append("Kalibr has none of the profile's extensions")
     return notes
-
-
-# ── measure ──────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def measure_imu_noise(time_s: Array, gyro_rad_s: Array, accel_m_s2: Array) -> ImuNoise | None:
-    """Measure the noise of samples (n,), (n, 3), (n, 3) taken in motion; None for too few samples.
-
-    Model: white noise on smooth hand motion.  Fifth differences keep the noise and suppress slow motion; windows are
-    chosen by their motion and not by their noise, so the choice does not bias it.  Too high for sampling rates below
-    100 Hz.  NaN in the accelerometer: its density is unknown.
-    """
-    if len(time_s) < MIN_NOISE_SAMPLES:
-        return None
-    rate_hz = 1.0 / float(np.median(np.diff(time_s)))
-    return ImuNoise(rate_hz, _density(gyro_rad_s, rate_hz), _density(accel_m_s2, rate_hz))
-
-
-def _density(samples: Array, rate_hz: float) -> float | None:
-    """Noise density per √Hz, the mean power of the three axes."""
-    samples = samples[np.isfinite(samples).all(axis=1)]
-    count = len(samples) // NOISE_WINDOW
-    if count < 2:
-        return None
-    windows = samples[: count * NOISE_WINDOW].reshape(count, NOISE_WINDOW, -1)
-    smooth = windows.reshape(count, 4, NOISE_WINDOW // 4, -1).mean(axis=2)
-    motion = np.square(np.diff(smooth, axis=1)).sum(axis=(1, 2))
-    still = windows[np.argsort(motion)[: max(round(STILLEST_PART * count), 1)]]
-    jumps = np.diff(still, n=DIFFERENCE_ORDER, axis=1)
-    deviation = np.median(np.abs(jumps), axis=(0, 1)) / NORMAL_MEDIAN / np.sqrt(DIFFERENCE_GAIN)
-    density = float(np.sqrt(np.mean(deviation**2) / rate_hz))
-    return density if density > 0 else None

@@ -7,6 +7,7 @@ import logging
 import numpy as np
 
 from virest.arrays import Array, Index
+from virest.capture.imu_noise import noise_density
 from virest.diagnosis import photometry, picture_ladder
 from virest.diagnosis.findings import GEOMETRY, PHOTOMETRY, Remaining
 from virest.diagnosis.geometric_verdict import GeometricVerdict
@@ -17,7 +18,6 @@ from virest.inference.blur_bias import RELATIVE_STD, blur_bias_px
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.robust import cauchy_weight, robust_std
 from virest.inference.track_fit import TrackFit
-from virest.motion.measured_rate import noise_density
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +109,8 @@ def _turned_by_noise_px(fitted: TrackFit, table: TrackTable) -> Array:
     assert lens is not None
     apart_s = np.abs(table.second_stamp_s - table.first_stamp_s)
     pair_s = np.bincount(table.pair, apart_s) / np.maximum(np.bincount(table.pair), 1)
-    return np.asarray(lens.fx_px * noise_density(fitted.integrated.measured.gyro) * np.sqrt(pair_s))
+    gyro = fitted.integrated.measured.gyro
+    return np.asarray(lens.fx_px * (noise_density(gyro.time_s, gyro.rate_rad_s) or 0.0) * np.sqrt(pair_s))
 
 
 def _from_centre_px(fitted: TrackFit, table: TrackTable) -> Array:

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from virest.arrays import Array
-from virest.camera.kalibr import measure_imu_noise
 from virest.capture.imu import ImuSamples
+from virest.capture.imu_noise import noise_density
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, predict
 from virest.motion.displacement import integrate_accelerometer
 from virest.motion.scene_motion import InertialMotion
@@ -26,10 +26,10 @@ def path_errors_px(imu: ImuSamples, known: IntegratedMotion, table: TrackTable, 
 
     The density is measured from the samples.  (0, n, 2) if there are too few of them.
     """
-    noise = measure_imu_noise(imu.time_s, imu.gyro_rad_s, imu.accel_m_s2)
-    if noise is None or noise.accel_density is None:
+    density = noise_density(imu.time_s, imu.accel_m_s2)
+    if density is None:
         return np.zeros((0, len(table), 2))
-    std_m_s2, rng = noise.accel_density * noise.update_rate_hz**0.5, np.random.default_rng(0)
+    std_m_s2, rng = density / float(np.median(np.diff(imu.time_s))) ** 0.5, np.random.default_rng(0)
     at, found = predict(known, table, scene), []
     for _ in range(DRAWS):
         noisy = replace(imu, accel_m_s2=imu.accel_m_s2 + rng.normal(0, std_m_s2, imu.accel_m_s2.shape))

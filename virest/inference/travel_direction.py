@@ -49,19 +49,25 @@ def without_directions(
 
     difference (n, 2): both components, in the units of ``left``.  Schur complement of two tangents per direction.
     """
-    moved = np.einsum("nij,nj->ni", flow, direction[group])
-    size = np.maximum(np.linalg.norm(moved, axis=-1), 1e-12)
-    way = moved / size[:, None]
-    normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
-    tangents = _tangents(direction)[group]
-    turn = np.einsum("nki,ni->nk", tangents, _dotted(normal, flow)) / size[:, None]
-    columns = turn * (way * difference).sum(axis=-1)[:, None]
-    both = np.concatenate([_dotted(normal, rows), (normal * left).sum(axis=-1)[:, None]], axis=1)
+    ahead, down = np.ascontiguousarray(flow.transpose(1, 2, 0))
+    facing = direction.T.take(group, axis=1)
+    way = np.stack([(ahead * facing).sum(axis=0), (down * facing).sum(axis=0)])
+    size = np.maximum(np.hypot(*way), 1e-12)
+    along_x, along_y = way / size
+    across = along_x * down - along_y * ahead
+    tangents = _tangents(direction).transpose(1, 2, 0).take(group, axis=2)
+    length = along_x * difference[:, 0] + along_y * difference[:, 1]
+    columns = np.ascontiguousarray(((tangents * across).sum(axis=1) * (length / size)).T)
+    both = np.empty((len(group), rows.shape[2] + 1))
+    both[:, :-1] = along_x[:, None] * rows[:, 1] - along_y[:, None] * rows[:, 0]
+    both[:, -1] = along_x * left[:, 1] - along_y * left[:, 0]
     belongs, weighed = _members(group, len(direction)), (columns * weight[:, None])[:, :, None]
     square = _group_sum(weighed * columns[:, None, :], belongs)
     square = square + 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 1e-12 * np.eye(2)
-    cross = _group_sum(weighed * both[:, None, :], belongs)
-    both = both - _dotted(columns, np.linalg.solve(square, cross)[group])
+    cross = np.linalg.solve(square, _group_sum(weighed * both[:, None, :], belongs))
+    for one, part in zip(columns.T, cross.swapaxes(0, 1), strict=True):
+        both -= one[:, None] * part[group]
+    normal = np.stack([-along_y, along_x], axis=-1)
     return normal[:, :, None] * both[:, None, :-1], normal * both[:, -1:]
 
 
@@ -77,11 +83,6 @@ def _tangents(direction: Array) -> Array:
     one = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
     one /= np.linalg.norm(one, axis=-1, keepdims=True)
     return np.stack([one, np.cross(direction, one)], axis=1)
-
-
-def _dotted(pair: Array, rows: Array) -> Array:
-    """(n, k): pairs (n, 2) times rows (n, 2, k)."""
-    return np.asarray(np.einsum("ni,nik->nk", pair, rows))
 
 
 def _members(group: Index, groups: int) -> csr_array:
