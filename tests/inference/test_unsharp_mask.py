@@ -8,6 +8,7 @@ from scipy.special import ndtr
 
 from virest.inference.unsharp_mask import (
     HIDDEN,
+    OUTLINED,
     SHARPENED,
     Overshoot,
     UnsharpMask,
@@ -74,7 +75,8 @@ def test_a_mask_is_detected(rng, scene, amount, radius_px):
     """Its gain is right within a third at frequencies at which pictures have detail."""
     found = seen(rng, scene, amount=amount, radius_px=radius_px)
     assert found is not None
-    mask = found.expected_mask()
+    assert found.overshoots
+    mask = found.mask()
     for frequency in (0.15, 0.3):
         passed, truth = (
             a * (1 - np.exp(-2 * (np.pi * r * frequency) ** 2))
@@ -94,7 +96,7 @@ def test_a_mask_is_detected_among_soft_edges(rng):
     """Most edges hide it in their tails; the sharpest ones reveal it."""
     found = seen(rng, with_tails, amount=0.8, radius_px=1.0)
     assert found is not None
-    mask = found.expected_mask()
+    mask = found.mask()
     assert mask.amount * mask.radius_px**2 == pytest.approx(0.8, rel=0.34)
 
 
@@ -104,7 +106,7 @@ def test_an_unsharpened_picture_has_no_mask(rng, scene):
     for picture in (scene, lambda r: cv2.GaussianBlur(scene(r), (0, 0), 1.2)):
         found = seen(rng, picture)
         assert found is not None
-        assert not found.certain
+        assert not found.overshoots
         assert found.expected_mask().amount < 0.15
 
 
@@ -112,7 +114,7 @@ def test_a_response_curve_is_not_a_mask(rng):
     """A curve shapes the two sides of an edge differently and exceeds neither plateau."""
     found = seen(rng, lambda r: 255 * (strokes(r) / 255) ** 0.5)
     assert found is not None
-    assert not found.certain
+    assert not found.overshoots
 
 
 def test_without_edges_no_mask_is_detected(rng):
@@ -148,20 +150,22 @@ def test_clipped_light_stays_clipped(rng):
     assert np.any(undone != shown)
 
 
-def test_an_uncertain_overshoot_is_reversed_in_part():
-    """The reversed part of the fitted mask grows with the overshoot of the sharpest edges, from next to none to all."""
+def test_an_overshoot_is_reversed_in_part():
+    """The reversed part of the mask grows with the sharpest edges' overshoot, up to what an outlined scene leaves."""
     shares = []
     for amount, p_value in ((0.3, 0.2), (0.5, 0.1), (0.6, 0.05), (0.8, 1e-4)):
         profile = _beside_line(np.array([0.8, amount, np.log(1.1), 6.0, 1.0, 0.0]))
         found = Overshoot(0.0, float(profile.max() - 1), p_value, 0.01, profile)
         shares.append(found.expected_mask().amount / found.mask().amount)
     assert 0.2 < shares[0] < shares[1] < shares[2] < shares[3]
-    assert shares[3] == 1.0
+    shown, outlined = SHARPENED * (1 - HIDDEN), (1 - SHARPENED) * OUTLINED
+    assert shares[3] == pytest.approx(shown / (shown + outlined), rel=0.02)
 
 
 def test_an_invisible_mask_is_expected_with_its_probability():
     """Edges without overshoot exclude a visible mask only: the usual one remains, if the edges hide it."""
     profile = _beside_line(np.array([0.5, 0.0, np.log(1.2), 20.0, 1.0, 0.0]))
     mask = Overshoot(0.0, 0.0, 1.0, 0.006, profile).expected_mask()
-    assert mask.amount == pytest.approx(0.6 * SHARPENED * HIDDEN / (1 - SHARPENED * (1 - HIDDEN)), rel=0.02)
+    hidden, bare = SHARPENED * HIDDEN, (1 - SHARPENED) * (1 - OUTLINED)
+    assert mask.amount == pytest.approx(0.6 * hidden / (hidden + bare), rel=0.02)
     assert mask.radius_px == pytest.approx(1.2, abs=0.02)

@@ -79,7 +79,7 @@ def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> t
     edges = overshoot(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
     if edges is None or (mask := edges.expected_mask()).amount <= RESIDUAL_AMOUNT:
         return plan, dict(sights)
-    seen = "edges overshoot as after" if edges.certain else "edges do not exclude"
+    seen = "edges overshoot as after" if edges.overshoots else "edges do not exclude"
     note = (
         f"{seen} a phone's sharpening: before deblurring, process undoes the expected unsharp mask, "
         f"of {mask.amount:.2g} with a radius of {mask.radius_px:.2g} px"
