@@ -24,7 +24,7 @@ from virest.diagnosis.field.form_list import forms_of_pairs
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import is_believable, with_fields
 from virest.diagnosis.field.stretches import bridging_form, rate_walk
-from virest.diagnosis.field.sudden import best_instant
+from virest.diagnosis.field.sudden import best_instant, sudden_change
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
 from virest.diagnosis.geometric_evidence import Evidence, Model, base_scene, make_evidence
@@ -276,6 +276,22 @@ def test_a_sudden_change_of_bias_is_a_step() -> None:
     assert field.fields[0].knots[0][0] == pytest.approx(1.13, abs=0.02)
     assert np.array(field.fields[0].values)[-1] == pytest.approx(-change, abs=0.002)
     assert verdict.final_rms_px < 1.1 * HAND.noise_px
+
+
+def test_inaccurate_points_of_blurred_frames_are_not_a_sudden_change() -> None:
+    """Pairs with 30 times the others' noise scatter by as much; a focal length that changes by 1 % is still found."""
+    evidence, fitted, table = fitted_to(StrangePhone(HAND, Strange()))
+    rng = np.random.default_rng(5)
+    noise_px = np.where(table.pair % 9 == 4, 30.0, 1.0) * HAND.noise_px
+    for _ in range(10):
+        scattered = table.second_px + noise_px[:, None] * rng.normal(size=(len(table), 2))
+        seen = point_residuals(evidence.imu, fitted, replace(table, second_px=scattered))
+        assert sudden_change(seen) is None
+        zoomed = scattered + np.where(table.pair == 25, 0.01, 0.0)[:, None] * (scattered - HAND.centre_px)
+        found = sudden_change(replace(seen, table=replace(table, second_px=zoomed)))
+        assert found is not None
+        assert found.pair == 25
+        assert found.scale == pytest.approx(0.01, rel=0.2)
 
 
 def test_a_bias_that_drifts_evenly_is_a_line_and_no_bias_beside_a_step() -> None:

@@ -49,7 +49,10 @@ class SuddenChange:
 
 
 def sudden_change(seen: PointResiduals) -> SuddenChange | None:
-    """The pair with the largest change of scale; None where it is not significant."""
+    """The pair with the most significant change of scale; None where no pair's is significant.
+
+    Each pair counts in its own standard deviations: blurred frames have few and inaccurate points.
+    """
     lens, table = seen.fit.profile.intrinsics, seen.table
     assert lens is not None
     arm = seen.prediction.second_px - np.array([lens.cx_px, lens.cy_px])
@@ -57,11 +60,10 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     pairs = [k for k, count in enumerate(np.bincount(table.pair)) if count >= LEAST_POINTS]
     if len(pairs) < LEAST_PAIRS:
         return None
-    growth = np.array([_growth(arm[table.pair == k], off[table.pair == k]) for k in pairs])
-    middle = float(np.median(growth))
-    spread = robust_std(growth - middle)
-    most = int(np.argmax(np.abs(growth - middle)))
-    ratio = abs(growth[most] - middle) / max(spread, 1e-12)
+    growth, std = np.transpose([_growth(arm[table.pair == k], off[table.pair == k]) for k in pairs])
+    beyond = (growth - np.median(growth)) / std
+    most = int(np.argmax(np.abs(beyond)))
+    ratio = abs(beyond[most]) / max(robust_std(beyond), 1.0)
     p_value = min(2 * len(pairs) * student_tail(ratio, len(pairs) - 1), 1.0)
     if p_value > FALSE_ALARM_RATE:
         return None
@@ -73,18 +75,23 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     return SuddenChange(pairs[most], at_s, float(growth[most]), p_value)
 
 
-def _growth(arm: Array, off: Array) -> float:
-    """Robust relative expansion of points with residuals off (n, 2) at arm (n, 2) from the centre, beside a shift."""
+def _growth(arm: Array, off: Array) -> tuple[float, float]:
+    """Robust relative expansion of points with residuals off (n, 2) at arm (n, 2) from the centre, beside a shift.
+
+    Returns its standard deviation too.
+    """
     design = np.concatenate([np.concatenate([arm[:, :1], arm[:, 1:]]), np.repeat(np.eye(2), len(arm), axis=0)], axis=1)
     flat = np.concatenate([off[:, 0], off[:, 1]])
     weight = np.ones(len(flat))
-    found = np.zeros(3)
+    found, scale = np.zeros(3), LEAST_SCALE
     for _ in range(_ITERATIONS):
         root = np.sqrt(weight)
         found = np.linalg.lstsq(design * root[:, None], flat * root, rcond=None)[0]
         left = flat - design @ found
-        weight = cauchy_weight(left**2, CAUCHY * max(robust_std(left), LEAST_SCALE))
-    return float(found[0])
+        scale = max(robust_std(left), LEAST_SCALE)
+        weight = cauchy_weight(left**2, CAUCHY * scale)
+    normal = design.T @ (weight[:, None] * design)
+    return float(found[0]), scale * float(np.sqrt(np.linalg.inv(normal)[0, 0]))
 
 
 def lasting_change(seen: PointResiduals, tangent: Array, effect: Array) -> float:
