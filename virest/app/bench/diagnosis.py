@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from virest.app.bench.workload import Scale
-from virest.app.console import numeric_table
+from virest.app.console import CONSOLE, numeric_table
 from virest.app.diagnose import open_source
 from virest.app.simulate import simulate_command
 from virest.diagnosis.findings import CONSISTENT, Diagnosis
@@ -32,7 +32,10 @@ def diagnosis_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     seeds = SEEDS["quick" if scale.quick else "full" if scale.full else "normal"]
     cases: list[Case] = [(name, 100 * k + i) for k in range(seeds) for i, name in enumerate(EFFECTS)]
     cases += [("", 9000 + k) for k in range(max(len(cases) // 4, 2))]
-    rows = [diagnose_hidden(work, *case) for case in cases]
+    rows = []
+    for case in cases:
+        rows.append(diagnose_hidden(work, *case))
+        CONSOLE.line("  ".join(filter(None, _shown(rows[-1]))))
     right = [row for row in rows if row["right"]]
     ratios = [r for row in rows for r in row["errors_in_std"]]
     summary = {

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from virest.app.bench.workload import Scale, run_process
-from virest.app.console import cell, numeric_table
+from virest.app.console import CONSOLE, cell, numeric_table
 from virest.app.diagnose import Source, open_source
 from virest.app.evaluation_captures import truth_frame
 from virest.arrays import Array
@@ -438,7 +438,10 @@ def fields_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     cases = [(name, FIRST_SEED + 10 * k + i) for k in range(SEEDS[scale.name]) for i, name in enumerate(EFFECTS)]
     cases += [(NAMED_ONLY, FIRST_SEED + 500 + k) for k in range(SEEDS[scale.name])]
     cases += [(NULL, FIRST_NULL + k) for k in range(NULLS[scale.name])]
-    rows = [judge_case(work, *case) for case in cases]
+    rows = []
+    for case in cases:
+        rows.append(judge_case(work, *case))
+        CONSOLE.line("  ".join(filter(None, shown(rows[-1]))))
     summary = summarise(rows)
     header = ["hidden", "seed", "size", "verdict", "causes", "fields", "gain", "elsewhere", "frames dB",
               "rms / noise px", "CPU s"]  # fmt: skip
