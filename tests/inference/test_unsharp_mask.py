@@ -162,6 +162,22 @@ def test_an_overshoot_is_reversed_in_part():
     assert shares[3] == pytest.approx(shown / (shown + outlined), rel=0.02)
 
 
+@pytest.mark.parametrize("scene", [strokes, discs])
+def test_an_outlined_scene_keeps_its_outlines(rng, scene):
+    """A scene may overshoot as a mask does: undoing what is expected harms it less than a blur of 3 px."""
+    outlined = masked(scene(rng), 0.8, 1.4)
+    found = overshoot([(recorded(rng, outlined), AT_REST) for _ in range(3)])
+    assert found is not None
+    assert found.overshoots
+
+    def harm(picture):
+        return np.sqrt(np.mean((picture.astype(float) - outlined)[20:-20, 20:-20] ** 2))
+
+    seen = np.clip(np.rint(outlined), 0, 255).astype(np.uint8)
+    assert harm(without_mask(seen, found.expected_mask())) < 0.9 * harm(cv2.blur(outlined, (3, 1)))
+    assert harm(without_mask(seen, found.mask())) > harm(cv2.blur(outlined, (3, 1)))
+
+
 def test_an_invisible_mask_is_expected_with_its_probability():
     """Edges without overshoot exclude a visible mask only: the usual one remains, if the edges hide it."""
     profile = _beside_line(np.array([0.5, 0.0, np.log(1.2), 20.0, 1.0, 0.0]))
