@@ -30,7 +30,10 @@ def test_growth_is_separated_from_a_shift_and_outliers(rng: np.random.Generator,
     arm = rng.uniform(-300, 300, (200, 2))
     off = growth * arm + (3.0, -2.0) + rng.normal(0, 0.1, arm.shape)
     off[:20] += rng.normal(0, 30, (20, 2))
-    assert _growth(arm, off) == pytest.approx(growth, abs=2e-4)
+    found, std = _growth(arm, off)
+    assert found == pytest.approx(growth, abs=2e-4)
+    assert std == pytest.approx(0.1 / np.sqrt((arm[20:] ** 2).sum()), rel=0.3)
+    assert abs(found - growth) < 3 * std
 
 
 def test_without_an_exposure_cause_there_is_no_exposure_variance() -> None:
