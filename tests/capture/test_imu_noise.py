@@ -27,7 +27,7 @@ def test_noise_is_measured_during_hand_motion(rng: np.random.Generator, rate_hz:
 
 
 def test_unmeasurable_noise_is_unknown(rng: np.random.Generator) -> None:
-    """Too few samples give no result; without accelerometer, or at 30 samples/s, there is no density."""
+    """Too few samples give no result; without accelerometer, or at 30 samples/s and less, there is no density."""
     gyro, none = rng.normal(0, 0.01, (600, 3)), np.full((600, 3), np.nan)
     assert measure_imu_noise(ImuSamples(TIME_S[:20], gyro[:20], none[:20])) is None
     found = measure_imu_noise(ImuSamples(TIME_S, gyro, none))
@@ -35,6 +35,7 @@ def test_unmeasurable_noise_is_unknown(rng: np.random.Generator) -> None:
     assert found.accel_density is None
     assert found.gyro_density is not None
     assert noise_density(TIME_S * 200 / 30, gyro) is None
+    assert noise_density(TIME_S * 200 / 0.3, gyro) is None
 
 
 def test_neither_motion_nor_low_pass_nor_vibration_changes_it(rng: np.random.Generator) -> None:

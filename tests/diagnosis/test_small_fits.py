@@ -8,6 +8,7 @@ import pytest
 from virest.diagnosis.field.sudden import _growth
 from virest.diagnosis.photometry_effects import _sines
 from virest.diagnosis.refit_photometry import _exposure_variance
+from virest.inference.chance import student_tail
 
 
 def test_a_sine_with_unequal_weights_is_found_with_its_phase(rng: np.random.Generator) -> None:
@@ -30,10 +31,25 @@ def test_growth_is_separated_from_a_shift_and_outliers(rng: np.random.Generator,
     arm = rng.uniform(-300, 300, (200, 2))
     off = growth * arm + (3.0, -2.0) + rng.normal(0, 0.1, arm.shape)
     off[:20] += rng.normal(0, 30, (20, 2))
-    found, std = _growth(arm, off)
+    found, std, _ = _growth(arm, off)
     assert found == pytest.approx(growth, abs=2e-4)
     assert std == pytest.approx(0.1 / np.sqrt((arm[20:] ** 2).sum()), rel=0.3)
     assert abs(found - growth) < 3 * std
+
+
+def test_the_growth_of_few_points_is_not_overrated(rng: np.random.Generator) -> None:
+    """Eight points determine their own accuracy badly: 1 % of their growths lie beyond 1 % of the distribution."""
+    rare = 0
+    for _ in range(1000):
+        found, std, freedom = _growth(rng.uniform(-300, 300, (8, 2)), rng.normal(0, 0.2, (8, 2)))
+        rare += student_tail(abs(found) / std, freedom) < 0.005
+    assert rare <= 20
+
+
+def test_points_in_one_place_show_no_growth(rng: np.random.Generator) -> None:
+    """They determine the shift alone."""
+    found, std, _ = _growth(np.full((8, 2), 100.0), rng.normal(0, 0.2, (8, 2)))
+    assert abs(found) < std
 
 
 def test_without_an_exposure_cause_there_is_no_exposure_variance() -> None:

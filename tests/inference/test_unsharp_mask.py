@@ -153,9 +153,9 @@ def test_clipped_light_stays_clipped(rng):
 def test_an_overshoot_is_reversed_in_part():
     """The reversed part of the mask grows with the sharpest edges' overshoot, up to what an outlined scene leaves."""
     shares = []
-    for amount, p_value in ((0.3, 0.2), (0.5, 0.1), (0.6, 0.05), (0.8, 1e-4)):
+    for amount in (0.3, 0.5, 0.6, 0.8):
         profile = _beside_line(np.array([0.8, amount, np.log(1.1), 6.0, 1.0, 0.0]))
-        found = Overshoot(0.0, float(profile.max() - 1), p_value, 0.01, profile)
+        found = Overshoot(0.0, float(profile.max() - 1), 1.0, 0.01, profile)
         shares.append(found.expected_mask().amount / found.mask().amount)
     assert 0.2 < shares[0] < shares[1] < shares[2] < shares[3]
     shown, outlined = SHARPENED * (1 - HIDDEN), (1 - SHARPENED) * OUTLINED

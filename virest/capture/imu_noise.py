@@ -46,9 +46,10 @@ def noise_density(time_s: Array, samples: Array) -> float | None:
     time_s, samples = time_s[known], samples[known]
     densities, weights = [], []
     for run in runs_without_gap(time_s):
-        if len(run) < LEAST_RUN:
+        step_s = float(np.median(np.diff(time_s[run]))) if len(run) >= LEAST_RUN else np.inf
+        if 2 * WHITE_BAND_HZ[0] * step_s > 1:
             continue
-        frequency_hz, power = _power_density(samples[run], float(np.median(np.diff(time_s[run]))))
+        frequency_hz, power = _power_density(samples[run], step_s)
         inside = (frequency_hz > WHITE_BAND_HZ[0]) & (frequency_hz < WHITE_BAND_HZ[1])
         above = frequency_hz > NOISE_BAND * frequency_hz[-1]
         if inside.any():
