@@ -64,10 +64,10 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     pairs = [k for k, count in enumerate(np.bincount(table.pair)) if count >= LEAST_POINTS]
     if len(pairs) < LEAST_PAIRS:
         return None
-    growth, std, freedom = np.transpose([_growth(arm[table.pair == k], off[table.pair == k]) for k in pairs])
+    growth, std, _ = np.transpose([_growth(arm[table.pair == k], off[table.pair == k]) for k in pairs])
     beyond = np.abs(growth - np.median(growth)) / std
     ratios = beyond / max(robust_std(beyond), 1.0)
-    tails = [student_tail(*one) for one in zip(ratios, np.minimum(freedom, len(pairs) - 1), strict=True)]
+    tails = [student_tail(ratio, len(pairs) - 1) for ratio in ratios]
     most = int(np.argmin(tails))
     p_value = min(2 * len(pairs) * tails[most], 1.0)
     if p_value > FALSE_ALARM_RATE:
