@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from virest.diagnosis.field.sudden import _growth
+from virest.diagnosis.field.sudden import _growth, _moderated
 from virest.diagnosis.photometry_effects import _sines
 from virest.diagnosis.refit_photometry import _exposure_variance
 from virest.inference.chance import student_tail
@@ -31,7 +31,8 @@ def test_growth_is_separated_from_a_shift_and_outliers(rng: np.random.Generator,
     arm = rng.uniform(-300, 300, (200, 2))
     off = growth * arm + (3.0, -2.0) + rng.normal(0, 0.1, arm.shape)
     off[:20] += rng.normal(0, 30, (20, 2))
-    found, std, _ = _growth(arm, off)
+    found, scale_px, per_px, _ = _growth(arm, off)
+    std = scale_px * per_px
     assert found == pytest.approx(growth, abs=2e-4)
     assert std == pytest.approx(0.1 / np.sqrt((arm[20:] ** 2).sum()), rel=0.3)
     assert abs(found - growth) < 3 * std
@@ -41,15 +42,26 @@ def test_the_growth_of_few_points_is_not_overrated(rng: np.random.Generator) -> 
     """Eight points determine their own accuracy badly: 1 % of their growths lie beyond 1 % of the distribution."""
     rare = 0
     for _ in range(1000):
-        found, std, freedom = _growth(rng.uniform(-300, 300, (8, 2)), rng.normal(0, 0.2, (8, 2)))
-        rare += student_tail(abs(found) / std, freedom) < 0.005
+        found, scale_px, per_px, freedom = _growth(rng.uniform(-300, 300, (8, 2)), rng.normal(0, 0.2, (8, 2)))
+        rare += student_tail(abs(found) / (scale_px * per_px), freedom) < 0.005
     assert rare <= 20
 
 
 def test_points_in_one_place_show_no_growth(rng: np.random.Generator) -> None:
     """They determine the shift alone."""
-    found, std, _ = _growth(np.full((8, 2), 100.0), rng.normal(0, 0.2, (8, 2)))
-    assert abs(found) < std
+    found, scale_px, per_px, _ = _growth(np.full((8, 2), 100.0), rng.normal(0, 0.2, (8, 2)))
+    assert abs(found) < scale_px * per_px
+
+
+@pytest.mark.parametrize(("spread", "degrees"), [(0.0, (30, np.inf)), (0.7, (1, 4))])
+def test_scales_support_each_other_as_far_as_they_agree(rng: np.random.Generator, spread: float, degrees) -> None:
+    """Equal scales are averaged; scales that differ by factors of 2 keep their own values."""
+    freedom = np.full(60, 6.0)
+    true = np.exp(rng.normal(0, spread, 60))
+    own = true * np.sqrt(rng.chisquare(freedom) / freedom)
+    found, total = _moderated(own, freedom)
+    assert degrees[0] < total[0] - 6 <= degrees[1]
+    assert np.std(np.log(found / true)) < np.std(np.log(own / true))
 
 
 def test_without_an_exposure_cause_there_is_no_exposure_variance() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import digamma, polygamma
 
 from virest.arrays import Array
 from virest.capture.records import Capture
@@ -32,6 +33,8 @@ between, at 0.05 rad/s and 600 px, is 0.1 px in one pair of frames."""
 MAD_EFFICIENCY = 0.37
 """A standard deviation from the median of magnitudes is as accurate as the usual one from this part of the values
 (Rousseeuw & Croux 1993, doi:10.1080/01621459.1993.10476408)."""
+LEAST_EXCESS = 1e-3
+"""Scatter of the logarithms of variances below which they count as equal: more than 2000 degrees of freedom."""
 LEAST_SCALE = 1e-9
 """Guard against a division by zero."""
 _ITERATIONS = 8
@@ -54,8 +57,7 @@ class SuddenChange:
 def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     """The pair with the most significant change of scale; None where no pair's is significant.
 
-    Each pair counts in its own standard deviations, which few points determine badly: blurred frames have few and
-    inaccurate points.
+    Each pair counts in its own standard deviations: blurred frames have few and inaccurate points.
     """
     lens, table = seen.fit.profile.intrinsics, seen.table
     assert lens is not None
@@ -64,10 +66,13 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     pairs = [k for k, count in enumerate(np.bincount(table.pair)) if count >= LEAST_POINTS]
     if len(pairs) < LEAST_PAIRS:
         return None
-    growth, std, _ = np.transpose([_growth(arm[table.pair == k], off[table.pair == k]) for k in pairs])
-    beyond = np.abs(growth - np.median(growth)) / std
+    found = [_growth(arm[table.pair == k], off[table.pair == k]) for k in pairs]
+    growth, scale_px, per_px, freedom = np.transpose(found)
+    noise_px = table.noise_px[pairs]
+    scale, freedom = _moderated(scale_px / noise_px, freedom)
+    beyond = np.abs(growth - np.median(growth)) / (scale * noise_px * per_px)
     ratios = beyond / max(robust_std(beyond), 1.0)
-    tails = [student_tail(ratio, len(pairs) - 1) for ratio in ratios]
+    tails = [student_tail(*one) for one in zip(ratios, np.minimum(freedom, len(pairs) - 1), strict=True)]
     most = int(np.argmin(tails))
     p_value = min(2 * len(pairs) * tails[most], 1.0)
     if p_value > FALSE_ALARM_RATE:
@@ -80,10 +85,10 @@ def sudden_change(seen: PointResiduals) -> SuddenChange | None:
     return SuddenChange(pairs[most], at_s, float(growth[most]), p_value)
 
 
-def _growth(arm: Array, off: Array) -> tuple[float, float, float]:
+def _growth(arm: Array, off: Array) -> tuple[float, float, float, float]:
     """Robust relative expansion of points with residuals off (n, 2) at arm (n, 2) from the centre, beside a shift.
 
-    Returns its standard deviation, and the degrees of freedom of that, too.
+    Returns also the points' standard deviation, that of the expansion per unit of it, and its degrees of freedom.
     """
     design = np.concatenate([np.concatenate([arm[:, :1], arm[:, 1:]]), np.repeat(np.eye(2), len(arm), axis=0)], axis=1)
     flat = np.concatenate([off[:, 0], off[:, 1]])
@@ -97,8 +102,27 @@ def _growth(arm: Array, off: Array) -> tuple[float, float, float]:
         weight = cauchy_weight(left**2, CAUCHY * scale)
     weights = weight.reshape(2, -1).T
     spread = arm - np.average(arm, axis=0, weights=weights)
-    std = scale / float(np.sqrt(max((weights * spread**2).sum(), LEAST_SCALE)))
-    return float(found[0]), std, MAD_EFFICIENCY * (design.shape[0] - design.shape[1])
+    per_px = 1 / float(np.sqrt(max((weights * spread**2).sum(), LEAST_SCALE)))
+    return float(found[0]), scale, per_px, MAD_EFFICIENCY * (design.shape[0] - design.shape[1])
+
+
+def _moderated(scale: Array, freedom: Array) -> tuple[Array, Array]:
+    """Scales (n,) with these degrees of freedom, each moved towards all others' as far as these agree; new degrees.
+
+    Variances are taken for draws from a scaled inverse chi-square law (Smyth 2004, doi:10.2202/1544-6115.1027),
+    whose degrees of freedom follow from the scatter of their logarithms beyond that of estimates.
+    """
+    level = 2 * np.log(np.maximum(scale, LEAST_SCALE)) - digamma(freedom / 2) + np.log(freedom / 2)
+    excess = float(np.var(level, ddof=1) - polygamma(1, freedom / 2).mean())
+    if excess <= LEAST_EXCESS:
+        return np.full(len(scale), np.exp(level.mean() / 2)), np.full(len(scale), np.inf)
+    half = 0.5 + 1 / excess
+    for _ in range(_ITERATIONS):  # Newton: trigamma(half) = excess
+        slope = polygamma(1, half)
+        half += slope * (1 - slope / excess) / polygamma(2, half)
+    typical = np.exp(level.mean() + digamma(half) - np.log(half))
+    total = 2 * half + freedom
+    return np.sqrt((2 * half * typical + freedom * scale**2) / total), total
 
 
 def lasting_change(seen: PointResiduals, tangent: Array, effect: Array) -> float:
