@@ -12,6 +12,7 @@ from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
 from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, fit_model, relief_loss
 from virest.image_formation.point_model import TrackTable
+from virest.inference.descent import Slopes
 from virest.inference.fit_start import FitStart
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.parallel import ParallelMap
@@ -118,7 +119,7 @@ Half = tuple[float, Model, float, float]
 
 
 def _screen(start: FitStart, model: Model, terms: Sequence[Term], iterations: int) -> Half:
-    fitted = fit_from(start, terms, max_iterations=iterations, covariances=False)
+    fitted = fit_from(start, terms, max_iterations=iterations, covariances=False, settled=Slopes.ON_THE_WAY)
     found = replace(model, profile=fitted.profile, scene=fitted.scene)
     return relief_loss(fitted), found, fitted.scale, fitted.depth_spread_per_m
 

@@ -170,11 +170,13 @@ class Evidence(Protocol[S, L]):
 
 
 def descend(
-    evidence: Evidence[S, L], state: S, max_iterations: int = MAX_ITERATIONS, look: L | None = None, fresh: bool = True
+    evidence: Evidence[S, L], state: S, max_iterations: int = MAX_ITERATIONS, look: L | None = None, fresh: bool = True,
+    settled: Slopes = Slopes.AT_THE_END,
 ) -> System[S, L]:
     """Levenberg-Marquardt; the scale of the residuals is updated after each accepted step.
 
-    look: at this state, from an earlier descent.  fresh: re-evaluate the final slopes if they are stale.
+    look: at this state, from an earlier descent.  fresh: re-evaluate the final slopes if they are stale.  settled:
+    slopes at which a small step ends the descent.
     """
     system = evidence.weighed(state, look or evidence.look(state, None, Slopes.HERE))
     if not system.prior.size:
@@ -190,6 +192,8 @@ def descend(
         after = evidence.weighed(moved, evidence.look(moved, system.look, Slopes.ON_THE_WAY))
         small = damping < 1 and step @ system.normal @ step < CONVERGED**2 * len(step)
         if after.cost(system.scale) > system.cost(system.scale) * (1 + 1e-9):
+            if small and not system.look.is_stale(settled):
+                break
             if system.look.is_stale(Slopes.HERE):
                 system = reevaluated(Slopes.HERE)
                 continue
@@ -198,10 +202,10 @@ def descend(
                 break
             continue
         system, damping = after, damping / 10 if damping > 0.1 * FIRST_DAMPING else 0.0
-        if small and not system.look.is_stale(Slopes.AT_THE_END):
+        if small and not system.look.is_stale(settled):
             break
         if small:
-            system = reevaluated(Slopes.AT_THE_END)
+            system = reevaluated(settled)
     if fresh and system.look.is_stale(Slopes.AT_THE_END):
         system = reevaluated(Slopes.AT_THE_END)
     return system

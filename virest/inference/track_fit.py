@@ -193,8 +193,12 @@ def fit_from(
     max_iterations: int = MAX_ITERATIONS,
     covariances: bool = True,
     errors_px: Array | None = None,
+    settled: Slopes = Slopes.AT_THE_END,
 ) -> TrackFit:
-    """:func:`fit_tracks` from a start that several fits may share."""
+    """:func:`fit_tracks` from a start that several fits may share.
+
+    settled: Slopes.ON_THE_WAY accepts slopes of the last steps at the end: quicker, with a loss that is slightly higher.
+    """
     terms, table, scene, known = tuple(terms), start.table, start.scene, start.known
     inertial, directed = isinstance(scene, InertialMotion), isinstance(scene, DirectedMotion)
     if inertial and known.displacement is None:
@@ -205,7 +209,7 @@ def fit_from(
     if isinstance(scene, InertialMotion) and max_iterations and not scene.velocity_m_s.any():
         state, look = _started(evidence, start, state, scene)
     for _ in range(SPREAD_PASSES if inertial else 1):
-        system = descend(evidence, state, max_iterations, look, covariances)
+        system = descend(evidence, state, max_iterations, look, covariances, settled)
         spread, look = evidence.depth_spread(system), system.look
         if not inertial or abs(spread - state.depth_spread) <= SPREAD_TOLERANCE * spread:
             break
