@@ -197,7 +197,7 @@ def fit_from(
 ) -> TrackFit:
     """:func:`fit_tracks` from a start that several fits may share.
 
-    settled: Slopes.ON_THE_WAY accepts slopes of the last steps at the end: quicker, with a loss that is slightly higher.
+    settled: Slopes.ON_THE_WAY accepts the slopes of the last steps: quicker, with a slightly higher loss.
     """
     terms, table, scene, known = tuple(terms), start.table, start.scene, start.known
     inertial, directed = isinstance(scene, InertialMotion), isinstance(scene, DirectedMotion)
