@@ -170,7 +170,11 @@ class Evidence(Protocol[S, L]):
 
 
 def descend(
-    evidence: Evidence[S, L], state: S, max_iterations: int = MAX_ITERATIONS, look: L | None = None, fresh: bool = True,
+    evidence: Evidence[S, L],
+    state: S,
+    max_iterations: int = MAX_ITERATIONS,
+    look: L | None = None,
+    fresh: bool = True,
     settled: Slopes = Slopes.AT_THE_END,
 ) -> System[S, L]:
     """Levenberg-Marquardt; the scale of the residuals is updated after each accepted step.
