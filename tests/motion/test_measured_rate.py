@@ -29,7 +29,7 @@ def filtered(frequency_hz: float) -> np.ndarray:
 @pytest.mark.parametrize("frequency_hz", [1.0, 4.0, 9.0])
 def test_a_low_pass_is_inverted(frequency_hz: float) -> None:
     """The original cosine is recovered at samples inside the log."""
-    pieces = measured(filtered(frequency_hz)).behind_low_pass(CUTOFF_HZ)
+    pieces = measured(filtered(frequency_hz)).before_filter(CUTOFF_HZ)
     true = np.cos(2 * np.pi * frequency_hz * TIME_S)
     np.testing.assert_allclose(pieces[3, 0, 80:-80], true[80:-81], atol=0.02)
 
@@ -37,14 +37,14 @@ def test_a_low_pass_is_inverted(frequency_hz: float) -> None:
 def test_no_filter_or_a_high_cutoff_changes_nothing() -> None:
     """A cutoff of 0 means no filter; at 10 kHz a rate of 4 Hz hardly changes."""
     rate = measured(filtered(4.0))
-    assert rate.behind_low_pass(0.0) is rate.pieces
-    np.testing.assert_allclose(rate.behind_low_pass(1e4)[3], rate.pieces[3], atol=1e-3)
+    assert rate.before_filter(0.0) is rate.pieces
+    np.testing.assert_allclose(rate.before_filter(1e4)[3], rate.pieces[3], atol=1e-3)
 
 
 def test_inverting_the_filter_hardly_amplifies_noise() -> None:
     """With white noise of 0.01 rad/s, a plain inverse amplifies noise 100 times at 100 Hz."""
     noise = np.random.default_rng(5).normal(0, 0.01, len(TIME_S))
-    clean, noisy = (measured(filtered(3.0) + n).behind_low_pass(CUTOFF_HZ)[3, 0] for n in (0 * noise, noise))
+    clean, noisy = (measured(filtered(3.0) + n).before_filter(CUTOFF_HZ)[3, 0] for n in (0 * noise, noise))
     spline, delay = CubicSpline(TIME_S, noise), delay_s(CUTOFF_HZ)
     bare = noise + delay * spline(TIME_S, 1) + 0.5 * delay**2 * spline(TIME_S, 2)
     assert np.std((noisy - clean)[40:-40]) < 0.1 * np.std(bare[40:-40])

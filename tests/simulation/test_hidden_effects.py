@@ -12,7 +12,7 @@ from virest.errors import SettingsError
 from virest.simulation.effects import EFFECTS, EffectContext, hide_effects
 from virest.simulation.hand_motion import random_hand_motion
 from virest.simulation.hidden import Hidden, shaded
-from virest.simulation.phone_gyro import before_low_pass, low_passed_rate
+from virest.simulation.phone_gyro import before_filter, filtered_rate
 from virest.simulation.session import SessionSettings, nominal_camera, plan_session, render_truth
 
 CHANGES = {
@@ -219,7 +219,7 @@ def test_a_low_pass_delays_rates_and_attenuates_fast_ones():
         def rate(t):
             return np.stack([np.sin(2 * np.pi * frequency_hz * t)] * 3, axis=1)
 
-        return low_passed_rate(rate, time_s, [20.0])[:, 0]
+        return filtered_rate(rate, time_s, [20.0])[:, 0]
 
     late_s = np.sqrt(2) / (2 * np.pi * 20)
     assert passed(2.0) == pytest.approx(np.sin(2 * np.pi * 2.0 * (time_s - late_s)), abs=2e-3)
@@ -239,8 +239,8 @@ def test_a_low_pass_can_be_inverted(rng):
     """Inverting a filter of 12 Hz brings a hand's rates 50 times closer to the true ones than the log."""
     motion = random_hand_motion(rng, rate_rms_rad_s=1.0, duration_s=2.0, band_hz=(0.5, 8.0))
     time_s = np.arange(-0.5, 2.5, 0.005)
-    true, logged = motion.rate_rad_s(time_s), low_passed_rate(motion.rate_rad_s, time_s, [12.0])
-    found = before_low_pass(time_s, logged, 12.0)
+    true, logged = motion.rate_rad_s(time_s), filtered_rate(motion.rate_rad_s, time_s, [12.0])
+    found = before_filter(time_s, logged, 12.0)
     inner = slice(60, -60)
     assert np.std((found - true)[inner]) < 0.02 * np.std((logged - true)[inner])
 

@@ -12,7 +12,7 @@ from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.profile_file import read_profile
 from virest.errors import SettingsError
-from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
+from virest.simulation.phone_gyro import filtered_rate, gyro_noise, jittered_ns, usual_delay_s
 from virest.simulation.phone_isp import ISPS, PhoneIsp, make_isp
 from virest.simulation.phone_pictures import (
     PhonePictures,
@@ -124,7 +124,7 @@ def test_the_low_pass_halves_the_power_at_its_corner():
         def rate(t):
             return np.stack([np.sin(2 * np.pi * frequency_hz * t)] * 3, axis=1)
 
-        return low_passed_rate(rate, time_s, [30.0], usual_delay_s(30.0))[:, 0], rate(time_s)[:, 0]
+        return filtered_rate(rate, time_s, [30.0], usual_delay_s(30.0))[:, 0], rate(time_s)[:, 0]
 
     slow, as_it_was = passed(2.0)
     assert slow == pytest.approx(as_it_was, abs=0.005)

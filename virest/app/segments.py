@@ -96,10 +96,10 @@ def cut_imu(imu: ImuSamples, frames: Sequence[Frame], plan: RestorationPlan) -> 
     """The samples that cover these frames' exposures, with a margin of 1 s on both sides.
 
     The state of a stabiliser depends on earlier motion; its samples start early enough for the cut not to matter.  To
-    undo a gyroscope's low-pass filter, its noise is measured on the whole log, which is then not cut.
+    undo a gyroscope's filter, its noise is measured on the whole log, which is then not cut.
     """
     profile = plan.profile
-    if profile.extensions.gyro_lowpass_hz:
+    if profile.extensions.gyro_lowpass_hz or profile.extensions.gyro_averaging_s:
         return imu
     rate, offset_s = 1.0 + profile.clock_skew, profile.time_offset_s or 0.0
     longest_s = max((frame.exposure_s or 0.0) for frame in frames) * profile.shutter.exposure_scale

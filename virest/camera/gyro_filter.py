@@ -1,11 +1,15 @@
-"""The low-pass filter that a gyroscope applies before it outputs samples: its cutoff, and its delay.
+"""The filter that a gyroscope applies before it outputs samples: its cutoff, its delay and its averaging time.
 
-A second-order Butterworth filter, H(s) = 1 / (1 + τs + τ²s²/2) with τ = √2 / (2π f): a loss of 3 dB at f, maximally
-flat below (Butterworth 1930, "On the theory of filter amplifiers").  The filters of phones' sensors are of this order
-and flat (InvenSense MPU-6050 register map, DLPF_CFG; Bosch BMI160 data sheet, gyroscope's cutoffs).
+The response of any filter begins as H(s) = 1 / (1 + τs + ½ (τ² − σ²) s² + …): τ is the mean of its impulse response
+and σ² the variance.  A second-order Butterworth filter of cutoff f has τ = √2 / (2π f) and σ = 0, exactly: a loss of
+3 dB at f, maximally flat below (Butterworth 1930, "On the theory of filter amplifiers").  Filters of phones' sensors
+are of this order and flat (InvenSense MPU-6050 register map, DLPF_CFG; Bosch BMI160 data sheet, gyroscope's cutoffs).
+A first-order filter has σ = τ, exactly; two equal ones in series σ = τ / √2, exactly; the mean over a window W has
+σ = W / √12, and no delay where its timestamps mark the window's middle.
 
-1 + τs + τ²s²/2 is e^{τs} to second order.  For motion well below f the filter is therefore a delay by τ; only the
-terms (2π f_rate τ)³/6 of the phase and (f_rate / f)⁴/2 of the amplitude distinguish it from a time offset.
+With σ = 0 the first terms are those of e^{τs}.  For motion well below f a flat filter is therefore a delay by τ; only
+the terms (2π f_rate τ)³/6 of the phase and (f_rate / f)⁴/2 of the amplitude distinguish it from a time offset.
+Averaging makes rotations at a frequency f_rate too small by the fraction ½ (2π f_rate σ)².
 """
 
 from __future__ import annotations
@@ -19,6 +23,11 @@ LEAST_HZ = 2.0
 def delay_s(cutoff_hz: float) -> float:
     """Delay τ of slow motion for a cutoff; 0 for 0, which means no filter.  A negative cutoff has a negative delay."""
     return math.sqrt(2.0) / (2 * math.pi * cutoff_hz) if cutoff_hz else 0.0
+
+
+def inverse_bend_s2(cutoff_hz: float, averaging_s: float) -> float:
+    """Factor ½ (τ² − σ²) of the second derivative in the inverse filter."""
+    return 0.5 * (delay_s(cutoff_hz) ** 2 - averaging_s**2)
 
 
 def cutoff_hz(delay_s: float) -> float:

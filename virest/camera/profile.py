@@ -53,6 +53,10 @@ class Extensions:
     defocus_sigma_px: float = 0.0
     gyro_lowpass_hz: float = 0.0
     """Cutoff of the gyroscope's own low pass (:mod:`virest.camera.gyro_filter`); 0: none."""
+    gyro_averaging_s: float = 0.0
+    """Standard deviation of the time over which the gyroscope averages, beyond the low pass; 0: none."""
+    gyro_misalignment_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """xy, xz, yz: part of an axis's rate that the other axis of the pair reads too; 0 where they are perpendicular."""
     stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
     """θ about x and y at the start of the inertial log; fitted but not stored in files: its effect decays soon."""
     field: tuple[ModelField, ...] = ()
@@ -156,6 +160,17 @@ class CameraProfile:
     def rotation_cam_imu(self) -> Array:
         """R_cam_imu, (3, 3)."""
         return np.array(self.r_cam_imu)
+
+    @property
+    def gyro_correction(self) -> Array:
+        """(3, 3) true rates per reading less bias: the inverse of S (I + Γ), S the scales and Γ the misalignment."""
+        xy, xz, yz = self.extensions.gyro_misalignment_rad
+        axes = np.array([[1.0, xy, xz], [xy, 1.0, yz], [xz, yz, 1.0]])
+        return np.asarray(np.linalg.inv(np.array(self.gyro_scale)[:, None] * axes))
+
+    def true_rate_rad_s(self, reading_rad_s: Array) -> Array:
+        """Rates (n, 3) of readings (n, 3), IMU axes, corrected for bias, scale and misalignment."""
+        return np.asarray((reading_rad_s - np.array(self.gyro_bias_rad_s)) @ self.gyro_correction.T)
 
     @property
     def pose_cam_imu(self) -> Array:

@@ -92,6 +92,8 @@ def _from_model(model: ProfileFile) -> CameraProfile:
             gain=tuple(extensions.gain),
             defocus_sigma_px=extensions.defocus.sigma_px,
             gyro_lowpass_hz=extensions.gyro_lowpass_hz,
+            gyro_averaging_s=extensions.gyro_averaging_s,
+            gyro_misalignment_rad=_triple(extensions.gyro_misalignment_rad),
         ),
         imu_untrusted_s=tuple(map(_pair, model.imu_untrusted_s)),
         imu_untrusted_stamp_0_ns=model.imu_untrusted_stamp_0_ns,
@@ -228,6 +230,10 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         extensions["defocus"] = {"sigma_px": ext.defocus_sigma_px}
     if ext.gyro_lowpass_hz:
         extensions["gyro_lowpass_hz"] = ext.gyro_lowpass_hz
+    if ext.gyro_averaging_s:
+        extensions["gyro_averaging_s"] = ext.gyro_averaging_s
+    if any(ext.gyro_misalignment_rad):
+        extensions["gyro_misalignment_rad"] = list(ext.gyro_misalignment_rad)
     # a field over the logged focal length belongs to the capture, not to the file
     if own := [entry for entry in profile.fields if entry.covariates != ("focal",)]:
         extensions["field"] = [_field_block(entry) for entry in own]

@@ -188,6 +188,8 @@ class ExtensionsBlock(_Strict):
     gain: list[Positive] = []
     defocus: _Defocus = _Defocus()
     gyro_lowpass_hz: Annotated[Number, Field(ge=0, lt=1e6)] = 0.0
+    gyro_averaging_s: Annotated[Number, Field(ge=0, lt=1)] = 0.0
+    gyro_misalignment_rad: Triple = [0.0, 0.0, 0.0]
     field: Annotated[list[FieldBlock], Field(max_length=500)] = []
 
 

@@ -59,7 +59,7 @@ RIVAL_T = 2.0
 """A cause is a rival if the blocks prefer the best one by less than this many standard errors."""
 EQUAL_T = 0.25
 """Two ends of the ladder are equally good below this many standard errors."""
-SIMPLER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length"}
+SIMPLER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length", "gyro_averaging": "gyro_scale"}
 """For slow rotations a low-pass filter is a delay; along one image direction a pixel aspect is a focal length.  Where
 the points cannot distinguish the two, the simpler cause is reported, with the other as its rival."""
 MAX_RUNGS = 5

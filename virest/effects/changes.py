@@ -51,10 +51,41 @@ def scale_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
     return replace(profile, gyro_scale=tuple((np.array(profile.gyro_scale) * np.exp(v[0])).tolist()))
 
 
+def skew_gyro_axes(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Multiply the scales of axes x, y, z by exp(v[0], v[1], −v[0] − v[1]); add v[2:] rad to the misalignment."""
+    scale = np.array(profile.gyro_scale) * np.exp([v[0], v[1], -v[0] - v[1]])
+    turned = np.array(profile.extensions.gyro_misalignment_rad) + v[2:]
+    skewed = profile.with_extensions(gyro_misalignment_rad=tuple(turned.tolist()))
+    return replace(skewed, gyro_scale=tuple(scale.tolist()))
+
+
+def gyro_axes_between(before: CameraProfile, after: CameraProfile) -> Array:
+    """(5,) the steps of :func:`skew_gyro_axes` between two profiles."""
+    ratio = np.log(axis_scale(after)) - np.log(axis_scale(before))
+    turned = np.subtract(after.extensions.gyro_misalignment_rad, before.extensions.gyro_misalignment_rad)
+    return np.concatenate([ratio[:2], turned])
+
+
+def axis_scale(profile: CameraProfile) -> Array:
+    """Scales (3,) of the gyroscope's axes over their mean."""
+    return np.array(profile.gyro_scale) / mean_gyro_scale(profile)
+
+
+def mean_gyro_scale(profile: CameraProfile) -> float:
+    """Geometric mean of the scales of the gyroscope's axes."""
+    return float(np.exp(np.log(profile.gyro_scale).mean()))
+
+
 def delay_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] seconds to the delay of the gyroscope's low-pass filter; no physical filter has a negative delay."""
     late_s = delay_s(profile.extensions.gyro_lowpass_hz) + float(v[0])
     return profile.with_extensions(gyro_lowpass_hz=cutoff_hz(late_s))
+
+
+def average_gyro(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] s² to the square of the gyroscope's averaging time, which has no negative values."""
+    squared = profile.extensions.gyro_averaging_s**2 + float(v[0])
+    return profile.with_extensions(gyro_averaging_s=float(np.sqrt(max(squared, 0.0))))
 
 
 def lengthen_readout(profile: CameraProfile, v: Array) -> CameraProfile:

@@ -42,9 +42,24 @@ def _second_relative(value: Any, std: Array) -> float:
     return float(std[1]) * abs(float(value))
 
 
+def _of_axes(value: Any, std: Array) -> list[float]:
+    """Deviations of three relative scales, of which two are steps and the third balances them."""
+    steps = (*std[:2], float(np.hypot(*std[:2])))
+    return [float(s) * abs(float(v)) for s, v in zip(steps, value, strict=True)]
+
+
+def _of_misalignment(value: Any, std: Array) -> list[float]:
+    return [float(s) for s in std[2:]]
+
+
 def _of_cutoff(value: Any, std: Array) -> float:
     """The step is the delay τ of a cutoff √2 / (2π τ), whose relative deviation is the same."""
     return float(std[0]) * abs(float(value)) / max(delay_s(value), 1e-9)
+
+
+def _of_root(value: Any, std: Array) -> float:
+    """Deviation of a value whose step is its square; near 0 that of the square decides."""
+    return float(std[0]) / max(2 * abs(float(value)), float(np.sqrt(std[0])), 1e-12)
 
 
 def _none(value: Any, std: Array) -> None:
@@ -88,6 +103,11 @@ def _estimated(name: str) -> Read:
 def _applied(size: str, text: str) -> Callable[[CameraProfile], str]:
     """A line for the log where the extension ``size`` is on; {} is filled with the extensions."""
     return lambda profile: text.format(e=profile.extensions) if getattr(profile.extensions, size) else ""
+
+
+def _applied_axes(profile: CameraProfile) -> str:
+    turned = profile.extensions.gyro_misalignment_rad
+    return f"gyroscope's misalignment of {', '.join(f'{t:g}' for t in turned)} rad: corrected" if any(turned) else ""
 
 
 GYRO_SCALE_OFF = 0.15
@@ -203,20 +223,40 @@ _POINTS = (
     Effect(
         "gyro_scale",
         GEOMETRY,
-        _value("gyro_scale", lambda p: float(np.mean(p.gyro_scale)), _relative),
+        _value("gyro_scale", by.mean_gyro_scale, _relative),
         "imu.gyro_scale",
         "the gyroscope's scale is off",
         "the gyroscope's rates are {gyro_scale} times the true ones",
-        Steps(by.scale_gyro, _log_ratio(lambda p: p.gyro_scale[0]), (1e-3,), (0.1,), (0.3,), 0.4),
+        Steps(by.scale_gyro, _log_ratio(by.mean_gyro_scale), (1e-3,), (0.1,), (0.3,), 0.4),
         calibrated=Calibrated(
             "gyro_scale",
-            lambda p: p.gyro_scale[0],
+            by.mean_gyro_scale,
             by.keep_value("gyro_scale"),
             0.02,
             "gyro-scale",
             GYRO_SCALE_OFF,
             True,
         ),
+    ),
+    Effect(
+        "gyro_axes",
+        GEOMETRY,
+        (
+            Parameter("axis_scale", lambda p, given: by.axis_scale(p).tolist(), _of_axes),
+            Parameter("misalignment_rad", lambda p, given: list(p.extensions.gyro_misalignment_rad), _of_misalignment),
+        ),
+        "imu.gyro_scale, extensions.gyro_misalignment_rad",
+        "the gyroscope's axes differ in scale or are not perpendicular",
+        "the gyroscope's axes read {axis_scale} times their mean, and {misalignment_rad} of each other (xy, xz, yz)",
+        Steps(
+            by.skew_gyro_axes,
+            by.gyro_axes_between,
+            (1e-3,) * 5,
+            (0.1,) * 5,
+            (0.1,) * 5,
+            GYRO_SCALE_OFF,
+        ),
+        applied=_applied_axes,
     ),
     Effect(
         "gyro_lowpass",
@@ -235,6 +275,24 @@ _POINTS = (
             ((0.006,), (0.02,)),
         ),
         applied=_applied("gyro_lowpass_hz", "gyroscope's low-pass filter of {e.gyro_lowpass_hz:g} Hz: undone"),
+    ),
+    Effect(
+        "gyro_averaging",
+        GEOMETRY,
+        _value("gyro_averaging_s", _extension("gyro_averaging_s"), _of_root),
+        "extensions.gyro_averaging_s",
+        "the gyroscope averages its rates over time: fast rotations read too small",
+        "the gyroscope averages its rates over {gyro_averaging_s} s (standard deviation): fast rotations read too small",
+        Steps(
+            by.average_gyro,
+            _difference(lambda p: p.extensions.gyro_averaging_s**2),
+            (1e-6,),
+            (2e-4,),
+            (INF,),
+            0.05**2,
+            ((1e-4,),),
+        ),
+        applied=_applied("gyro_averaging_s", "gyroscope's averaging over {e.gyro_averaging_s:g} s: undone"),
     ),
     Effect(
         "imu_rotation",

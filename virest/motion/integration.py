@@ -30,12 +30,12 @@ def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRa
 def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
     """Sum of the profile's fields of kind ``rate`` at the samples (n, 3), IMU axes; None without such fields.
 
-    Rate covariates are the gyroscope's readings after correction for bias and scale.
+    Rate covariates are the gyroscope's readings after correction for bias, scale and misalignment.
     """
     fields = [field for field in profile.extensions.field if field.kind == "rate"]
     if not fields:
         return None
-    rate = (imu.gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
+    rate = profile.true_rate_rad_s(imu.gyro_rad_s)
     known = {"time": imu.time_s}
     known |= {name: rate[:, k] for k, name in enumerate(RATES)}
     known |= {name: np.nan_to_num(imu.accel_m_s2[:, k]) for k, name in enumerate(FORCES)}
@@ -43,10 +43,11 @@ def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
 
 
 def _camera_rate(measured: MeasuredRate, profile: CameraProfile) -> Array:
-    """True rate in camera axes, pieces (4, 3, n − 1): R_cam_imu (measured, low-pass filter undone, − bias) / scale."""
-    unbiased = measured.behind_low_pass(profile.extensions.gyro_lowpass_hz).copy()
+    """True rate in camera axes, pieces (4, 3, n − 1): R_cam_imu ((I + Γ) S)⁻¹ (measured, its filter undone, − bias)."""
+    extensions = profile.extensions
+    unbiased = measured.before_filter(extensions.gyro_lowpass_hz, extensions.gyro_averaging_s).copy()
     unbiased[3] -= np.array(profile.gyro_bias_rad_s)[:, None]
-    return np.asarray((profile.rotation_cam_imu / np.array(profile.gyro_scale)) @ unbiased)
+    return np.asarray(profile.rotation_cam_imu @ profile.gyro_correction @ unbiased)
 
 
 def _running_product(steps: Array) -> Array:

@@ -1,7 +1,7 @@
 """The gyroscope's rate between samples, and the true rate before its low-pass filter.
 
-The rate is a cubic spline m(t) through the samples.  Before a second-order Butterworth low-pass filter
-(:mod:`virest.camera.gyro_filter`) the true rate is exactly m + τ m′ + ½ τ² m″: again a cubic on each piece.
+The rate is a cubic spline m(t) through the samples.  Before a filter of delay τ and averaging time σ
+(:mod:`virest.camera.gyro_filter`) the true rate is m + τ m′ + ½ (τ² − σ²) m″: again a cubic on each piece.
 
 Derivatives amplify the noise of the samples.  The best linear estimate of the true rate therefore uses the derivatives
 of the best estimate of m, for any filter (a linear function of a conditional mean is the conditional mean of that
@@ -22,7 +22,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import gammainccinv
 
 from virest.arrays import Array
-from virest.camera.gyro_filter import delay_s
+from virest.camera.gyro_filter import delay_s, inverse_bend_s2
 from virest.capture.imu import ImuSamples
 from virest.capture.imu_noise import LEAST_RUN, NOISE_BAND, runs_without_gap
 from virest.errors import ImuError
@@ -44,16 +44,16 @@ class MeasuredRate:
     pieces: Array
     """(4, 3, n − 1) cubic pieces between the samples, highest power first, IMU axes."""
 
-    def behind_low_pass(self, cutoff_hz: float) -> Array:
-        """Pieces (4, 3, n − 1) of the rate before a low-pass filter of this cutoff; 0: no filter."""
-        delay = delay_s(cutoff_hz)
-        if not delay:
+    def before_filter(self, cutoff_hz: float, averaging_s: float = 0.0) -> Array:
+        """Pieces (4, 3, n − 1) of the rate before a filter of this cutoff and averaging time; 0, 0: no filter."""
+        delay, bend = delay_s(cutoff_hz), inverse_bend_s2(cutoff_hz, averaging_s)
+        if not delay and not bend:
             return self.pieces
         a, b, c, _ = self._without_noise
         undone = self.pieces.copy()
         undone[1] += 3 * a * delay
-        undone[2] += 2 * b * delay + 3 * a * delay**2
-        undone[3] += c * delay + b * delay**2
+        undone[2] += 2 * b * delay + 6 * a * bend
+        undone[3] += c * delay + 2 * b * bend
         return undone
 
     @cached_property

@@ -182,6 +182,18 @@ def _bend_radially(profile: CameraProfile, values: list[float]) -> CameraProfile
     return _lens(profile, coefficients=(values[0], *lens.coefficients[1:]))
 
 
+def _draw_axes(_: CameraProfile, context: EffectContext) -> list[float]:
+    x, y = (round(1 + _signed(context, 0.02, 0.04), 6) for _ in range(2))
+    return [x, y, round(1 / (x * y), 6), *(_signed(context, 0.01, 0.03) for _ in range(3))]
+
+
+def _skew_axes(profile: CameraProfile, values: list[float]) -> CameraProfile:
+    """Multiply the scales of the gyroscope's axes x, y, z; add the misalignment of xy, xz, yz."""
+    scale = tuple(s * v for s, v in zip(profile.gyro_scale, values[:3], strict=True))
+    turned = tuple(a + b for a, b in zip(profile.extensions.gyro_misalignment_rad, values[3:], strict=True))
+    return replace(profile, gyro_scale=scale).with_extensions(gyro_misalignment_rad=turned)
+
+
 def _draw_frame_lag(_: CameraProfile, context: EffectContext) -> list[float]:
     repeats = max(1, min(int(context.rng.integers(3, 8)), context.frames // 3))
     return [round(repeats / context.fps, 6), float(min(3 * repeats, context.frames - 1))]
@@ -240,9 +252,14 @@ _BY_NAME: dict[str, Effect] = {
         lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)],
         lambda p, v: replace(p, gyro_scale=tuple(s * v[0] for s in p.gyro_scale)),
     ),
+    "gyro_axes": Effect(_draw_axes, _skew_axes),
     "gyro_lowpass": Effect(
         lambda p, c: [_between(c, 8.0, 20.0)],
         lambda p, v: p.with_extensions(gyro_lowpass_hz=v[0]),
+    ),
+    "gyro_averaging": Effect(
+        lambda p, c: [_between(c, 0.008, 0.015)],
+        lambda p, v: p.with_extensions(gyro_averaging_s=v[0]),
     ),
     "imu_rotation": Effect(lambda p, c: [_signed(c, 0.015, 0.04) for _ in range(3)], _rotate_imu),
     "focal_length": Effect(lambda p, c: [round(1 + _signed(c, 0.03, 0.06), 6)], _scale_focal),
@@ -292,7 +309,11 @@ _BY_NAME: dict[str, Effect] = {
     ),
 }
 
-_PARTS = {"gyro_bias": ("x", "y", "z"), "imu_rotation": ("x", "y", "z"), "principal_point": ("x", "y")}
+_PARTS = {
+    **dict.fromkeys(("gyro_bias", "imu_rotation"), ("x", "y", "z")),
+    "gyro_axes": ("x", "y", "z", "xy", "xz", "yz"),
+    "principal_point": ("x", "y"),
+}
 """Component names of vector effects."""
 
 EFFECTS = {

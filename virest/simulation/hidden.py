@@ -154,11 +154,26 @@ def missing_rate_rad_s(profile: CameraProfile, time_s: Array, reading: Array, fo
 
 
 def gyro_reading(profile: CameraProfile, time_s: Array, rate_rad_s: Array, force_m_s2: Array) -> Array:
-    """Gyroscope reading (n, 3) for true rates and forces (n, 3), IMU axes: scale (ω − fields) + bias.
+    """Gyroscope reading (n, 3) for true rates and forces (n, 3), IMU axes: scale · across(ω − fields) + bias.
+
+    across: each axis also reads parts of the other two where they are not perpendicular.
 
     A field over rates is a function of the corrected reading itself, hence the fixed-point iteration.
     """
     reading = rate_rad_s
     for _ in range(10 if any(field.kind == "rate" for field in profile.extensions.field) else 0):
         reading = rate_rad_s - missing_rate_rad_s(profile, time_s, reading, force_m_s2)
-    return np.asarray(reading * profile.gyro_scale + profile.gyro_bias_rad_s)
+    return np.asarray(_across(profile, reading) * profile.gyro_scale + profile.gyro_bias_rad_s)
+
+
+def _across(profile: CameraProfile, rate_rad_s: Array) -> Array:
+    """Rates (n, 3) as axes that are not perpendicular sense them."""
+    xy, xz, yz = profile.extensions.gyro_misalignment_rad
+    x, y, z = rate_rad_s.T
+    return np.stack([x + xy * y + xz * z, xy * x + y + yz * z, xz * x + yz * y + z], axis=-1)
+
+
+def from_gyro_reading(profile: CameraProfile, reading_rad_s: Array) -> Array:
+    """Rates (n, 3) of readings (n, 3) without fields: the inverse of :func:`gyro_reading`."""
+    axes = _across(profile, np.eye(3))
+    return np.linalg.solve(axes, ((reading_rad_s - profile.gyro_bias_rad_s) / profile.gyro_scale).T).T

@@ -1,4 +1,4 @@
-"""A phone's gyroscope: low-pass filter, noise and timestamp jitter."""
+"""A phone's gyroscope: filters, noise and timestamp jitter."""
 
 from __future__ import annotations
 
@@ -18,27 +18,42 @@ MOST_JITTER = 0.45
 """Limit on the jitter, as a fraction of the shortest sampling interval, so that timestamps stay in order."""
 
 
-def low_passed_rate(
-    rate_rad_s: Callable[[Array], Array], time_s: Array, corners_hz: Sequence[float], removed_delay_s: float = 0.0
+def filtered_rate(
+    rate_rad_s: Callable[[Array], Array],
+    time_s: Array,
+    corners_hz: Sequence[float],
+    removed_delay_s: float = 0.0,
+    window_s: float = 0.0,
 ) -> Array:
-    """Rates (n, 3) at time_s after a cascade of causal second-order Butterworth low-pass filters.
+    """Rates (n, 3) at time_s after a cascade of causal second-order Butterworth filters and a mean over a window.
 
     removed_delay_s: filter delay that the recorder subtracts from the timestamps, see :func:`usual_delay_s`.  Each
-    filter is solved exactly for a rate that is linear within steps of FINE_STEP_S.
+    filter is solved exactly for a rate that is linear within steps of FINE_STEP_S.  window_s: the timestamps mark the
+    window's middle.
     """
     from scipy.signal import butter, cont2discrete, lfilter, lfilter_zi  # with it all of `scipy.stats` is loaded
 
-    begin_s = time_s[0] + removed_delay_s - sum(SETTLING_PERIODS / corner for corner in corners_hz)
-    fine_s = np.arange(begin_s, time_s[-1] + removed_delay_s + 2 * FINE_STEP_S, FINE_STEP_S)
+    begin_s = time_s[0] + removed_delay_s - sum(SETTLING_PERIODS / corner for corner in corners_hz) - window_s
+    fine_s = np.arange(begin_s, time_s[-1] + removed_delay_s + window_s + 2 * FINE_STEP_S, FINE_STEP_S)
     filtered = rate_rad_s(fine_s)
     for corner_hz in corners_hz:
         analogue = butter(2, 2 * np.pi * corner_hz, analog=True)
         b, a, _ = cont2discrete(analogue, FINE_STEP_S, method="foh")
         state = lfilter_zi(b[0], a)[:, None] * filtered[0]
         filtered, _ = lfilter(b[0], a, filtered, axis=0, zi=state)
-    return np.stack(
-        [np.interp(time_s + removed_delay_s, fine_s, filtered[:, i]) for i in range(filtered.shape[1])], axis=1
-    )
+    at_s = time_s + removed_delay_s
+    if not window_s:
+        return np.stack([np.interp(at_s, fine_s, column) for column in filtered.T], axis=1)
+    steps = 0.5 * (filtered[1:] + filtered[:-1]) * FINE_STEP_S
+    angle = np.concatenate([np.zeros((1, filtered.shape[1])), np.cumsum(steps, axis=0)])
+    ends = (at_s + 0.5 * window_s, at_s - 0.5 * window_s)
+    after, before = (np.stack([np.interp(end, fine_s, column) for column in angle.T], axis=1) for end in ends)
+    return np.asarray((after - before) / window_s)
+
+
+def averaging_window_s(averaging_s: float) -> float:
+    """Length of the window whose mean has this averaging time: √12 standard deviations of a uniform distribution."""
+    return float(np.sqrt(12.0)) * averaging_s
 
 
 def usual_delay_s(corner_hz: float) -> float:
@@ -50,8 +65,8 @@ def usual_delay_s(corner_hz: float) -> float:
     return float(np.sqrt(2.0) / (2 * np.pi * corner_hz)) if corner_hz else 0.0
 
 
-def before_low_pass(time_s: Array, rate_rad_s: Array, corner_hz: float) -> Array:
-    """Undo a low-pass filter: rates (n, 3) before it, for recreating a motion from a phone's log.
+def before_filter(time_s: Array, rate_rad_s: Array, corner_hz: float, window_s: float = 0.0) -> Array:
+    """Undo a gyroscope's filters: rates (n, 3) before them, for recreating a motion from a phone's log.
 
     Regularised inverse in the frequency domain, on an even grid mirrored at both ends:
     conj(H) (1 + ε²) / (|H|² + ε²), ε = LEAST_RESPONSE, so the gain at zero frequency is 1 and components with |H| < ε
@@ -61,8 +76,11 @@ def before_low_pass(time_s: Array, rate_rad_s: Array, corner_hz: float) -> Array
     even_s = np.linspace(time_s[0], time_s[-1], count)
     even = np.stack([np.interp(even_s, time_s, column) for column in rate_rad_s.T], axis=1)
     mirrored = np.concatenate([even, even[-2:0:-1]])
-    frequency = np.fft.rfftfreq(len(mirrored), even_s[1] - even_s[0])[:, None] / corner_hz
-    response = 1 / (1 - frequency**2 + 1j * np.sqrt(2.0) * frequency)
+    frequency_hz = np.fft.rfftfreq(len(mirrored), even_s[1] - even_s[0])[:, None]
+    response = np.sinc(frequency_hz * window_s).astype(complex)
+    if corner_hz:
+        part = frequency_hz / corner_hz
+        response /= 1 - part**2 + 1j * np.sqrt(2.0) * part
     change = np.conj(response) / (np.abs(response) ** 2 + LEAST_RESPONSE**2) * (1 + LEAST_RESPONSE**2) - 1
     added = np.fft.irfft(change * np.fft.rfft(mirrored, axis=0), n=len(mirrored), axis=0)[:count]
     return rate_rad_s + np.stack([np.interp(time_s, even_s, column) for column in added.T], axis=1)

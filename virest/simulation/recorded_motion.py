@@ -17,8 +17,8 @@ from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.errors import ImuError
 from virest.simulation.hand_motion import HandMotion, Waves, integrate_motion
-from virest.simulation.hidden import missing_rate_rad_s
-from virest.simulation.phone_gyro import before_low_pass
+from virest.simulation.hidden import from_gyro_reading, missing_rate_rad_s
+from virest.simulation.phone_gyro import averaging_window_s, before_filter
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +43,15 @@ def recorded_rate(
 ) -> RecordedRate:
     """True rate of the camera from samples (n,), (n, 3) at increasing times.
 
-    R_cam_imu ((measured − bias) / scale + fields), the measured rate with its low-pass filter undone.  sample_s:
+    R_cam_imu (across⁻¹((measured − bias) / scale) + fields), the measured rate with the gyroscope's filters undone.  sample_s:
     seconds on the IMU clock from stamp_0.  Raises ImuError for fewer than two samples.
     """
     if len(sample_s) < 2:
         raise ImuError(f"{len(sample_s)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
-    if profile.extensions.gyro_lowpass_hz:
-        gyro_rad_s = before_low_pass(sample_s, gyro_rad_s, profile.extensions.gyro_lowpass_hz)
-    true = (gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
+    corner_hz, averaging_s = profile.extensions.gyro_lowpass_hz, profile.extensions.gyro_averaging_s
+    if corner_hz or averaging_s:
+        gyro_rad_s = before_filter(sample_s, gyro_rad_s, corner_hz, averaging_window_s(averaging_s))
+    true = from_gyro_reading(profile, gyro_rad_s)
     true = true + missing_rate_rad_s(profile, sample_s, true, accel_m_s2)
     camera = true @ np.array(profile.r_cam_imu).T
     return RecordedRate(float(sample_s[0]), float(sample_s[-1]), Akima1DInterpolator(sample_s, camera, method="makima"))

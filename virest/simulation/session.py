@@ -26,7 +26,7 @@ from virest.simulation.auto_exposure import AutoExposure, Exposures, plan_exposu
 from virest.simulation.exposure import View, expose, instant, make_view, pixel_rays
 from virest.simulation.hand_motion import HandMotion, random_hand_motion
 from virest.simulation.hidden import NOTHING, Hidden, defocused, gyro_reading, shaded
-from virest.simulation.phone_gyro import gyro_noise, jittered_ns, low_passed_rate, usual_delay_s
+from virest.simulation.phone_gyro import averaging_window_s, filtered_rate, gyro_noise, jittered_ns, usual_delay_s
 from virest.simulation.phone_isp import OFF, PhoneIsp
 from virest.simulation.phone_pictures import PhonePictures, roll_off_highlights, tone_curve
 from virest.simulation.scenes import LENS_SIGMA_PX, Scene, add_moving_objects, add_near_objects, make_scene
@@ -473,11 +473,13 @@ def _gain(session: Session, slot: int) -> float:
 
 
 def _gyro_rate(session: Session, time_s: Array) -> Array:
-    """Rates (n, 3), camera axes, after the gyroscope's low-pass filters."""
+    """Rates (n, 3), camera axes, after the gyroscope's filters."""
     rate, corners_hz = session.motion.rate_rad_s, _corners_hz(session)
-    if not corners_hz:
+    window_s = averaging_window_s(session.true.extensions.gyro_averaging_s)
+    if not corners_hz and not window_s:
         return rate(time_s)
-    return low_passed_rate(rate, time_s, corners_hz, usual_delay_s(session.settings.isp.gyro_lowpass_hz))
+    delay_s = usual_delay_s(session.settings.isp.gyro_lowpass_hz)
+    return filtered_rate(rate, time_s, corners_hz, delay_s, window_s)
 
 
 def _corners_hz(session: Session) -> list[float]:

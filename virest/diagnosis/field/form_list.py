@@ -51,7 +51,7 @@ LEAST_FOCUS_CHANGE = 0.05
 """Dioptres; a smaller focus change shifts no point by 1 px."""
 READOUTS = frozenset({"readout_time", f"delay{OVER}row"})
 LENSES = frozenset({"radial_distortion", f"displacement{OVER}x, y"})
-GYROS = frozenset({"gyro_scale", f"rate{OVER}rate"})
+GYROS = frozenset({"gyro_scale", "gyro_axes", f"rate{OVER}rate"})
 """Terms that already model the constant part of a pair."""
 
 
@@ -148,8 +148,8 @@ def _with_knots(field: Field, count: int) -> Field:
 
 
 def _reaches(imu: ImuSamples, profile: CameraProfile, part: float = 1.0) -> list[float]:
-    """Quantile ``part`` of the absolute rate on the 3 axes, after bias and scale correction, rad/s."""
-    reading = (imu.gyro_rad_s - np.array(profile.gyro_bias_rad_s)) / np.array(profile.gyro_scale)
+    """Quantile ``part`` of the absolute corrected rate on the 3 axes, rad/s."""
+    reading = profile.true_rate_rad_s(imu.gyro_rad_s)
     return [max(float(most), LEAST_REACH_RAD_S) for most in np.quantile(np.abs(reading), part, axis=0)]
 
 
@@ -328,7 +328,7 @@ def _over_rates(
     """
     fields, bases = [], []
     for axis, (name, reach) in enumerate(zip(RATES, _reaches(imu, profile, part), strict=True)):
-        reading = (imu.gyro_rad_s[:, axis] - profile.gyro_bias_rad_s[axis]) / profile.gyro_scale[axis]
+        reading = profile.true_rate_rad_s(imu.gyro_rad_s)[:, axis]
         field = _zero("rate", (name,), [steps * reach])
         own = np.zeros((3, 1))
         own[axis] = 1.0
