@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
 from motion.synthetic_tracks import Recording, Setup
 
+from virest.camera.gyro_filter import delay_s
 from virest.camera.profile import CameraProfile
 from virest.diagnosis import candidates
 from virest.diagnosis.findings import Finding, ParameterChange
@@ -114,11 +116,12 @@ def test_a_wrong_readout_direction_is_named() -> None:
     assert verdict.model.profile.shutter == truth.shutter
 
 
-@pytest.mark.parametrize(("seed", "scale"), [(81, 1.12), (82, 0.9)])
-def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: float) -> None:
+@pytest.mark.parametrize(("seed", "scale", "as_pair"), [(81, 1.12, True), (82, 0.9, False)])
+def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: float, as_pair: bool) -> None:
     """A wrong gyroscope scale and a focal length that compensates for it are wrong only for roll.
 
-    Correcting one alone is worse.
+    Correcting one alone is worse.  as_pair: they enter on one rung; else a distortion and unequal axes enter before
+    them and are removed.
     """
     setup = replace(HAND, seed=seed, frames=61, about=(0.8, 1.0, 1.0), gyro_scale=scale)
     truth = recorded(setup).profile
@@ -130,7 +133,7 @@ def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: fl
     named = {finding.name: finding for finding in found}
     assert set(named) == {"gyro_scale", "focal_length"}
     assert verdict.final_rms_px == pytest.approx(setup.noise_px, rel=0.1)
-    assert any(rung.has("gyro_scale") and rung.has("focal_length") for rung in verdict.rungs)
+    assert as_pair == any(rung.has("gyro_scale") and rung.has("focal_length") for rung in verdict.rungs)
     assert_holds(named["gyro_scale"].parameters["gyro_scale"], 1.0, scale)
     assert_holds(named["focal_length"].parameters["focal_scale"], 1.0, scale)
     for finding in found:
@@ -177,6 +180,56 @@ def test_a_low_pass_above_hand_motion_is_reported_as_an_offset(hidden: str, like
     assert "gyro_lowpass" in {rival.name for rival in found[0].rivals}
     told = found[0].parameters["time_offset_s"]
     assert abs(told.estimate - offset_s - late_s) < 4 * told.std
+
+
+GYROSCOPES = ("gyro_scale", "gyro_axes", "gyro_bias", "gyro_lowpass", "gyro_averaging", "imu_rotation")
+
+
+@pytest.fixture
+def gyroscopes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Candidates limited to a gyroscope's errors, the clock and the lens."""
+    beside = ("time_offset", "readout_time", "focal_length", "radial_distortion", "stabilisation")
+    monkeypatch.setattr(candidates, "GEOMETRIC_EFFECTS", tuple(EFFECT[name] for name in (*GYROSCOPES, *beside)))
+
+
+@pytest.mark.parametrize(
+    ("filters", "late_s", "averaging_s"),
+    [
+        ({"gyro_lag_s": (0.01,)}, 0.01, 0.01),
+        ({"gyro_lag_s": (0.006, 0.006)}, 0.012, np.sqrt(2) * 0.006),
+        ({"gyro_window_s": 0.03}, 0.0, 0.03 / np.sqrt(12)),
+    ],
+    ids=["first order", "two equal stages", "mean around its timestamp"],
+)
+def test_a_gyroscope_filter_of_another_family_is_a_delay_and_an_average(
+    filters: dict[str, Any], late_s: float, averaging_s: float, gyroscopes: None
+) -> None:
+    """The delay and the width of the filter's response are named with their sizes, and neither clock nor scale is."""
+    setup = replace(HAND, seed=87, frames=61, **filters)
+    verdict, found = climbed(setup, recorded(setup).profile)
+    assert {finding.name for finding in found} == {"gyro_averaging", *(["gyro_lowpass"] if late_s else [])}
+    assert_explained(verdict, HAND.noise_px)
+    told = {finding.name: next(iter(finding.parameters.values())) for finding in found}
+    width = told["gyro_averaging"]
+    assert abs(width.estimate - averaging_s) < 4 * width.std < 0.2 * averaging_s
+    if late_s:
+        assert delay_s(told["gyro_lowpass"].estimate) == pytest.approx(late_s, rel=0.03)
+
+
+def test_axes_that_differ_are_named_and_neither_lens_nor_focal_length_is(gyroscopes: None) -> None:
+    """One axis of another scale resembles a focal length; axes that are not perpendicular resemble a rotation."""
+    axes = ((1.0, 0.02, 0.0), (0.02, 1.0, -0.015), (0.0, -0.015, 0.93))
+    setup = replace(HAND, seed=88, frames=61, gyro_axes=axes)
+    verdict, found = climbed(setup, recorded(setup).profile)
+    assert {finding.name for finding in found} == {"gyro_axes", "gyro_scale"}
+    assert_explained(verdict, HAND.noise_px)
+    whole = np.cbrt(0.93)
+    told = {finding.name: finding.parameters for finding in found}
+    np.testing.assert_allclose(told["gyro_scale"]["gyro_scale"].estimate, whole, atol=0.003)
+    np.testing.assert_allclose(told["gyro_axes"]["axis_scale"].estimate, np.array([1, 1, 0.93]) / whole, atol=0.003)
+    misalignment = told["gyro_axes"]["misalignment_rad"]
+    true_rad = (0.02, 0.0, -0.015 / np.sqrt(0.93))  # rows and columns over the roots of the scales
+    assert np.all(np.abs(np.subtract(misalignment.estimate, true_rad)) < 4 * np.array(misalignment.std))
 
 
 def test_a_clock_offset_is_not_a_low_pass(like_them: None) -> None:
@@ -328,7 +381,7 @@ def test_the_total_change_equals_the_change_of_a_term(effect: object) -> None:
     entry = EFFECT[effect.name]  # type: ignore[attr-defined]
     assert entry.term is not None
     profile = recorded(HAND).profile
-    step = np.array([0.004, -0.007, 0.011, -0.002])[: len(entry.term)]
+    step = np.array([0.004, -0.007, 0.011, -0.002, 0.005])[: len(entry.term)]
     found = entry.total_change(profile, entry.term.change(profile, step))
     # a stabiliser's cutoff has no zero, and its lean does not belong to the cause
     known = slice(0, 1) if entry.name == "stabilisation" else slice(None)

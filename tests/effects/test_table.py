@@ -86,6 +86,8 @@ OTHER_EXTENSION: dict[str, Any] = {
     "gain": (1.0, 1.1),
     "defocus_sigma_px": 1.0,
     "gyro_lowpass_hz": 12.0,
+    "gyro_averaging_s": 0.01,
+    "gyro_misalignment_rad": (0.02, -0.01, 0.03),
     "field": (LOGGED, replace(DRIVEN, values=((0.05, 0.0, 0.0), (0.0, 0.0, 0.05)))),
 }
 
@@ -168,8 +170,8 @@ def test_the_simulator_has_exactly_the_effects_of_the_table() -> None:
 def test_every_sentence_can_be_filled_and_every_unit_is_known() -> None:
     """A parameter's suffix is a unit, unless it is a ratio or a word."""
     plain = {"clock_skew", "readout_direction", "timestamp", "exposure_scale", "gyro_scale", "focal_scale", "k1",
-             "pixel_aspect", "fraction", "frames", "gamma", "black_level", "corner_loss", "amplitude", "gain",
-             "amount"}  # fmt: skip
+             "pixel_aspect", "axis_scale", "fraction", "frames", "gamma", "black_level", "corner_loss", "amplitude",
+             "gain", "amount"}  # fmt: skip
     for effect in EFFECTS.values():
         assert effect.sentence.format(**{parameter.name: 1.0 for parameter in effect.parameters})
         assert effect.in_words
@@ -184,11 +186,11 @@ def test_values_follow_their_steps(name: str) -> None:
     assert effect.steps is not None
     profile = recorded(SWAYING).profile
     profile = replace(profile, extensions=replace(profile.extensions, gyro_lowpass_hz=20.0))
-    step = 1e-3 * np.array(effect.steps.quotient)
-    before, after = (effect.read(p, profile) for p in (profile, effect.steps.change(profile, step)))
-    for parameter, size in effect.spread(before, step).items():
-        moved = np.abs(np.subtract(after[parameter], before[parameter]))
-        np.testing.assert_allclose(moved, size, rtol=1e-2, atol=1e-12)
+    for step in np.diag(1e-3 * np.array(effect.steps.quotient)):
+        before, after = (effect.read(p, profile) for p in (profile, effect.steps.change(profile, step)))
+        for parameter, size in effect.spread(before, step).items():
+            moved = np.abs(np.subtract(after[parameter], before[parameter]))
+            np.testing.assert_allclose(moved, size, rtol=1e-2, atol=1e-12)
 
 
 def test_causes_of_points_except_depth_and_lag_have_steps_or_words() -> None:

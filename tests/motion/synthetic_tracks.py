@@ -12,6 +12,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
@@ -64,6 +65,12 @@ class Setup:
     gyro_scale: float = 1.0
     gyro_lowpass_hz: float = 0.0
     """Cutoff of a second-order Butterworth low pass on the rates; 0: none."""
+    gyro_lag_s: tuple[float, ...] = ()
+    """Time constants of first-order low passes on the rates, in series."""
+    gyro_window_s: float = 0.0
+    """Length of a window, around each timestamp, whose mean rate is logged."""
+    gyro_axes: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Rows: what each axis reads of the rates about x, y and z."""
     r_cam_imu: tuple[Triple, ...] = tuple(map(tuple, R_CAM_IMU.tolist()))  # type: ignore[assignment]
     arm_m: Triple = (0.0, 0.0, 0.0)
     accel_bias_m_s2: Triple = (0.05, -0.08, 0.03)
@@ -156,20 +163,29 @@ class Recording:
         """Gyroscope and accelerometer at 210 Hz, from 1 s before the first timestamp to 1 s after the last."""
         setup, to_imu = self.setup, np.array(self.setup.r_cam_imu)
         time_s = np.arange(-1.0, self.stamp_s[-1] + 1.0, 1 / 210) + setup.time_offset_s
-        gyro = setup.gyro_scale * self._passed_rate(time_s) @ to_imu + np.array(setup.gyro_bias_rad_s)
+        gyro = setup.gyro_scale * self._passed_rate(time_s) @ to_imu @ np.array(setup.gyro_axes).T
+        gyro = gyro + np.array(setup.gyro_bias_rad_s)
         gyro = gyro + np.random.default_rng(setup.seed + 90).normal(0, 1, gyro.shape) * setup.gyro_noise_rad_s
         force = self.specific_force(time_s - setup.accel_delay_s) @ to_imu + np.array(setup.accel_bias_m_s2)
         return ImuSamples(time_s, gyro, force if setup.accelerometer else np.full_like(force, np.nan))
 
     def _passed_rate(self, time_s: Array) -> Array:
         """Rates (n, 3) after the gyroscope's low-pass filter, in steps of 0.1 ms by the trapezoidal rule."""
-        cutoff_hz, step_s = self.setup.gyro_lowpass_hz, 1e-4
-        if not cutoff_hz:
+        setup, cutoff_hz, step_s = self.setup, self.setup.gyro_lowpass_hz, 1e-4
+        if not (cutoff_hz or setup.gyro_lag_s or setup.gyro_window_s):
             return self.rate(time_s)
-        fine_s = np.arange(time_s[0] - 3 / cutoff_hz, time_s[-1] + step_s, step_s)
-        slow = np.pi * cutoff_hz * step_s  # s becomes 2 (1 - 1/z) / (step (1 + 1/z)) in H = 1 / (1 + √2 s/ω + s²/ω²)
-        back = [1 + np.sqrt(2) * slow + slow**2, 2 * slow**2 - 2, 1 - np.sqrt(2) * slow + slow**2]
-        passed = lfilter(slow**2 * np.array([1, 2, 1]), back, self.rate(fine_s), axis=0)
+        longest_s = max(3 / cutoff_hz if cutoff_hz else 0.0, 20 * sum(setup.gyro_lag_s), setup.gyro_window_s)
+        fine_s = np.arange(time_s[0] - longest_s, time_s[-1] + setup.gyro_window_s + step_s, step_s)
+        passed = self.rate(fine_s)
+        if cutoff_hz:
+            slow = np.pi * cutoff_hz * step_s  # s: 2 (1 - 1/z) / (step (1 + 1/z)) in H = 1 / (1 + √2 s/ω + s²/ω²)
+            back = [1 + np.sqrt(2) * slow + slow**2, 2 * slow**2 - 2, 1 - np.sqrt(2) * slow + slow**2]
+            passed = lfilter(slow**2 * np.array([1, 2, 1]), back, passed, axis=0)
+        for lag_s in setup.gyro_lag_s:
+            slow = 0.5 * step_s / lag_s
+            passed = lfilter(slow * np.array([1, 1]), [1 + slow, slow - 1], passed, axis=0)
+        if setup.gyro_window_s:
+            passed = uniform_filter1d(passed, round(setup.gyro_window_s / step_s) | 1, axis=0, mode="nearest")
         return np.stack([np.interp(time_s, fine_s, column) for column in passed.T], axis=1)
 
     @cached_property

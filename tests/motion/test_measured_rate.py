@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -32,6 +34,29 @@ def test_a_low_pass_is_inverted(frequency_hz: float) -> None:
     pieces = measured(filtered(frequency_hz)).before_filter(CUTOFF_HZ)
     true = np.cos(2 * np.pi * frequency_hz * TIME_S)
     np.testing.assert_allclose(pieces[3, 0, 80:-80], true[80:-81], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("response", "delay", "averaging_s"),
+    [
+        (lambda s: 1 / (1 + 0.008 * s), 0.008, 0.008),
+        (lambda s: 1 / (1 + 0.005 * s) ** 2, 0.01, np.sqrt(2) * 0.005),
+        (lambda s: np.sinh(0.012 * s) / (0.012 * s), 0.0, 0.024 / np.sqrt(12)),
+        (lambda s: np.exp(-0.012 * s) * np.sinh(0.012 * s) / (0.012 * s), 0.012, 0.024 / np.sqrt(12)),
+    ],
+    ids=["first order", "two equal stages", "mean around its timestamp", "mean before its timestamp"],
+)
+def test_filters_of_other_families_are_inverted_by_their_delay_and_averaging(
+    response: Callable[[complex], complex], delay: float, averaging_s: float
+) -> None:
+    """A rotation of 5 Hz is recovered to 1 % where a filter of the same delay alone leaves 2 to 7 %."""
+    s = 2j * np.pi * 5.0
+    true = np.exp(s * TIME_S)
+    rate = measured(np.real(response(s) * true))
+    cutoff = cutoff_hz(delay)
+    both, flat = (rate.before_filter(cutoff, width)[3, 0, 80:-80] for width in (averaging_s, 0.0))
+    np.testing.assert_allclose(both, np.real(true)[80:-81], atol=0.01)
+    assert np.abs(flat - np.real(true)[80:-81]).max() > 0.02
 
 
 def test_no_filter_or_a_high_cutoff_changes_nothing() -> None:

@@ -340,11 +340,12 @@ def _for_frames(
 
 
 def _corrected_gyro(capture: Capture, profile: CameraProfile) -> Array:
-    """Gyroscope readings (n, 3) corrected for all errors but bias, scale and noise."""
-    missing = missing_rate_rad_s(capture.imu, profile)
-    if missing is None:
-        return capture.imu.gyro_rad_s
-    return np.asarray(capture.imu.gyro_rad_s + np.array(profile.gyro_scale) * missing)
+    """Gyroscope readings (n, 3) corrected for misalignment and fields; bias, scale, filter and noise stay."""
+    gyro, missing = capture.imu.gyro_rad_s, missing_rate_rad_s(capture.imu, profile)
+    if missing is None and not any(profile.extensions.gyro_misalignment_rad):
+        return gyro
+    true = profile.true_rate_rad_s(gyro) + (0.0 if missing is None else missing)
+    return np.asarray(true * np.array(profile.gyro_scale) + np.array(profile.gyro_bias_rad_s))
 
 
 def _imu_time_ns(capture: Capture, profile: CameraProfile) -> NDArray[np.int64]:

@@ -61,6 +61,11 @@ CASES: dict[str, Case] = {
     "gyro_bias": Case("0.03,-0.02,0.025", "a constant shift from frame to frame, whatever the motion"),
     "gyro_scale": Case("1.03", "residuals proportional to the rotation rate; roll separates it from the focal length"),
     "gyro_lowpass": Case("12", "like a time offset, but fast rotations are too small: the gyroscope's low-pass filter"),
+    "gyro_averaging": Case("0.012", "fast rotations are too small, slow ones are right, and none is late"),
+    "gyro_axes": Case(
+        "1.02,1.01,0.97,0.015,-0.01,0.02",
+        "residuals proportional to the rotation rate, of another size and direction about each axis",
+    ),
     "imu_rotation": Case("0.02,-0.015,0.03", "residuals across the direction of motion"),
     "focal_length": Case("1.03", "residuals proportional to the rotation rate in pitch and yaw, not in roll"),
     "pixel_aspect": Case("1.02", "residuals that grow with the rotation rate in pitch, not in yaw or roll"),

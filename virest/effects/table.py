@@ -282,7 +282,7 @@ _POINTS = (
         _value("gyro_averaging_s", _extension("gyro_averaging_s"), _of_root),
         "extensions.gyro_averaging_s",
         "the gyroscope averages its rates over time: fast rotations read too small",
-        "the gyroscope averages its rates over {gyro_averaging_s} s (standard deviation): fast rotations read too small",
+        "the gyroscope averages its rates over {gyro_averaging_s} s (standard deviation): fast ones read too small",
         Steps(
             by.average_gyro,
             _difference(lambda p: p.extensions.gyro_averaging_s**2),

@@ -9,6 +9,7 @@ import numpy as np
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
+from virest.effects.changes import mean_gyro_scale
 from virest.effects.table import GYRO_SCALE_OFF
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
@@ -98,7 +99,7 @@ def _gyro_scales(_: TrackTable) -> Array:
 
 
 def _gyro_ratio(given: CameraProfile, found: CameraProfile) -> float:
-    return found.gyro_scale[0] / given.gyro_scale[0]
+    return mean_gyro_scale(found) / mean_gyro_scale(given)
 
 
 def _with_gyro_scale(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
@@ -133,12 +134,12 @@ CAUSES = (
         GYROSCOPE,
         terms_of.GYRO_SCALE,
         _gyro_scales,
-        lambda given, found: abs(found.gyro_scale[0] - 1) < GYRO_SCALE_OFF,
+        lambda given, found: abs(mean_gyro_scale(found) - 1) < GYRO_SCALE_OFF,
         lambda given, found: float(np.log(_gyro_ratio(given, found))),
         _with_gyro_scale,
         lambda given, found, std: (
-            f"gyroscope scale of {found.gyro_scale[0]:.4f} ± {found.gyro_scale[0] * std[0]:.4f} used "
-            f"instead of the profile's {given.gyro_scale[0]:g}"
+            f"gyroscope scale of {mean_gyro_scale(found):.4f} ± {mean_gyro_scale(found) * std[0]:.4f} used "
+            f"instead of the profile's {mean_gyro_scale(given):g}"
         ),
     ),
     Cause(

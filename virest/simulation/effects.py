@@ -189,9 +189,10 @@ def _draw_axes(_: CameraProfile, context: EffectContext) -> list[float]:
 
 def _skew_axes(profile: CameraProfile, values: list[float]) -> CameraProfile:
     """Multiply the scales of the gyroscope's axes x, y, z; add the misalignment of xy, xz, yz."""
-    scale = tuple(s * v for s, v in zip(profile.gyro_scale, values[:3], strict=True))
-    turned = tuple(a + b for a, b in zip(profile.extensions.gyro_misalignment_rad, values[3:], strict=True))
-    return replace(profile, gyro_scale=scale).with_extensions(gyro_misalignment_rad=turned)
+    scale = np.multiply(profile.gyro_scale, values[:3])
+    turned = np.add(profile.extensions.gyro_misalignment_rad, values[3:])
+    skewed = profile.with_extensions(gyro_misalignment_rad=tuple(turned.tolist()))
+    return replace(skewed, gyro_scale=tuple(scale.tolist()))
 
 
 def _draw_frame_lag(_: CameraProfile, context: EffectContext) -> list[float]:

@@ -176,4 +176,5 @@ def _across(profile: CameraProfile, rate_rad_s: Array) -> Array:
 def from_gyro_reading(profile: CameraProfile, reading_rad_s: Array) -> Array:
     """Rates (n, 3) of readings (n, 3) without fields: the inverse of :func:`gyro_reading`."""
     axes = _across(profile, np.eye(3))
-    return np.linalg.solve(axes, ((reading_rad_s - profile.gyro_bias_rad_s) / profile.gyro_scale).T).T
+    sensed = (reading_rad_s - profile.gyro_bias_rad_s) / profile.gyro_scale
+    return np.asarray(np.linalg.solve(axes, sensed.T).T)

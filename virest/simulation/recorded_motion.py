@@ -43,8 +43,8 @@ def recorded_rate(
 ) -> RecordedRate:
     """True rate of the camera from samples (n,), (n, 3) at increasing times.
 
-    R_cam_imu (across⁻¹((measured − bias) / scale) + fields), the measured rate with the gyroscope's filters undone.  sample_s:
-    seconds on the IMU clock from stamp_0.  Raises ImuError for fewer than two samples.
+    R_cam_imu (across⁻¹((measured − bias) / scale) + fields), the measured rate with the gyroscope's filters undone.
+    sample_s: seconds on the IMU clock from stamp_0.  Raises ImuError for fewer than two samples.
     """
     if len(sample_s) < 2:
         raise ImuError(f"{len(sample_s)} gyroscope samples, at least 2 are needed", hint="check gyro_accel.csv")
