@@ -1,7 +1,8 @@
 """The gyroscope's rate between samples, and the true rate before its low-pass filter.
 
 The rate is a cubic spline m(t) through the samples.  Before a filter of delay τ and averaging time σ
-(:mod:`virest.camera.gyro_filter`) the true rate is m + τ m′ + ½ (τ² − σ²) m″: again a cubic on each piece.
+(:mod:`virest.camera.gyro_filter`) the true rate is m + τ m′ + ½ (τ² − σ²) m″: again a cubic on each piece.  A mean over
+a window around each timestamp is undone at the samples, by its response at each frequency.
 
 Derivatives amplify the noise of the samples.  The best linear estimate of the true rate therefore uses the derivatives
 of the best estimate of m, for any filter (a linear function of a conditional mean is the conditional mean of that
@@ -22,13 +23,15 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import gammainccinv
 
 from virest.arrays import Array
-from virest.camera.gyro_filter import delay_s, inverse_bend_s2
+from virest.camera.gyro_filter import delay_s, inverse_bend_s2, window_s
 from virest.capture.imu import ImuSamples
 from virest.capture.imu_noise import LEAST_RUN, NOISE_BAND, runs_without_gap
 from virest.errors import ImuError
 
 BAND_PART = 40
 """The power at a frequency is the mean over 1 / this of the band: about 30 values in 3 s at 400 samples/s."""
+LEAST_RESPONSE = 0.25
+"""A mean over a window is undone up to the frequency where it leaves this much: 0.81 / window."""
 FALSE_ALARM = 1e-3
 """Probability that samples of pure noise have significant power anywhere in the band."""
 
@@ -47,10 +50,13 @@ class MeasuredRate:
     def before_filter(self, cutoff_hz: float, averaging_s: float = 0.0) -> Array:
         """Pieces (4, 3, n − 1) of the rate before a filter of this cutoff and averaging time; 0, 0: no filter."""
         delay, bend = delay_s(cutoff_hz), inverse_bend_s2(cutoff_hz, averaging_s)
-        if not delay and not bend:
+        if not delay and not averaging_s:
             return self.pieces
-        a, b, c, _ = self._without_noise
-        undone = self.pieces.copy()
+        undone, clean = self.pieces.copy(), self._without_noise
+        if window := window_s(cutoff_hz, averaging_s):
+            before_mean = self._denoised(window)
+            undone, clean = undone + before_mean - clean, before_mean
+        a, b, c, _ = clean
         undone[1] += 3 * a * delay
         undone[2] += 2 * b * delay + 6 * a * bend
         undone[3] += c * delay + 2 * b * bend
@@ -59,10 +65,15 @@ class MeasuredRate:
     @cached_property
     def _without_noise(self) -> Array:
         """Like ``pieces``, from denoised samples."""
+        return self._denoised(0.0)
+
+    def _denoised(self, window_s: float) -> Array:
+        """The same for the rate whose means over this window the denoised samples are."""
         rate = self.rate_rad_s.copy()
         for run in runs_without_gap(self.time_s):
             if len(run) >= LEAST_RUN:
-                rate[run] = without_noise(rate[run])
+                step_s = float(self.time_s[run[-1]] - self.time_s[run[0]]) / (len(run) - 1)
+                rate[run] = without_noise(rate[run], window_s / step_s)
         return _pieces(self.time_s, rate)
 
 
@@ -76,10 +87,11 @@ def measured_rate(imu: ImuSamples) -> MeasuredRate:
     return MeasuredRate(imu.time_s, imu.gyro_rad_s, _pieces(imu.time_s, imu.gyro_rad_s))
 
 
-def without_noise(samples: Array) -> Array:
+def without_noise(samples: Array, window: float = 0.0) -> Array:
     """Wiener estimate (n, k) of the signal in evenly spaced samples (n, k) with white noise, column by column.
 
-    The cosine transform mirrors the samples at both ends, which avoids steps there.
+    The cosine transform mirrors the samples at both ends, which avoids steps there.  window: the signal's means over
+    this many samples were recorded.
     """
     amplitude = dct(samples, axis=0, norm="ortho")
     band = max(len(samples) // BAND_PART, 5)
@@ -87,7 +99,8 @@ def without_noise(samples: Array) -> Array:
     noise = np.median(power[int(NOISE_BAND * len(samples)) :], axis=0)
     by_chance = 2 * gammainccinv(band / 2, FALSE_ALARM * band / len(samples)) / band  # chi-square of normal values
     kept = np.where(power > by_chance * noise, 1 - noise / np.maximum(power, 1e-300), 0.0)
-    return np.asarray(idct(kept * amplitude, axis=0, norm="ortho"))
+    response = np.maximum(np.sinc(np.arange(len(samples))[:, None] * window / (2 * len(samples))), LEAST_RESPONSE)
+    return np.asarray(idct(kept / response * amplitude, axis=0, norm="ortho"))
 
 
 def _pieces(time_s: Array, rate: Array) -> Array:
