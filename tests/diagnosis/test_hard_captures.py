@@ -18,7 +18,7 @@ from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
 from virest.diagnosis import photometry_fit
-from virest.diagnosis.ambiguities import offset_as_timestamp
+from virest.diagnosis.ambiguities import offset_as_timestamp, offset_beside_averaging
 from virest.diagnosis.findings import CONSISTENT, GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Model, make_evidence
@@ -177,6 +177,15 @@ def test_an_offset_without_exposures_has_the_exposure_as_rival() -> None:
     verdict = SimpleNamespace(nominal=Model(CameraProfile(640, 480), None, ()))
     (named,) = offset_as_timestamp(verdict, [finding], np.zeros(5))  # type: ignore[arg-type]
     assert [rival.name for rival in named.rivals] == ["exposure_time"]
+
+
+@pytest.mark.parametrize(("beside", "rivals"), [("gyro_averaging", ["gyro_lowpass"]), ("gyro_scale", [])])
+def test_an_offset_beside_a_filter_of_unknown_shape_has_the_filter_as_rival(beside: str, rivals: list[str]) -> None:
+    """How much of a delay belongs to the filter depends on its shape."""
+    gain = HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1)
+    late = Finding("time_offset", {"time_offset_s": ParameterChange(0.0, 0.004, 1e-5)}, gain, (), 1e-9, "")
+    found = offset_beside_averaging([late, replace(late, name=beside)])
+    assert [[rival.name for rival in finding.rivals] for finding in found] == [rivals, []]
 
 
 @pytest.mark.parametrize(("shift_s", "std_s", "name"), [

@@ -16,6 +16,7 @@ from virest.diagnosis.findings import Finding, ParameterChange, Rival
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.tracking_stage import with_flicker_of
 
+OFFSETS = frozenset({"time_offset", "timestamp_reference"})
 COINCIDENCE_SIGMA, COINCIDENCE_PART = 3.5, 0.25
 """An offset is attributed to another timestamp reference if it agrees within this many standard deviations and within
 this part of the reference's own shift: a deviation that an unmodelled effect has widened agrees with everything."""
@@ -60,6 +61,23 @@ def offset_as_timestamp(geometric: GeometricVerdict, findings: list[Finding], ex
         profile = replace(geometric.model.profile.with_shutter(timestamp=meaning), time_offset_s=nominal.time_offset_s)
         geometric.model = replace(geometric.model, profile=profile)
     return result
+
+
+def offset_beside_averaging(findings: Sequence[Finding]) -> list[Finding]:
+    """An offset of the clocks beside a gyroscope that averages, with the gyroscope's filter as its rival.
+
+    Filters of one delay and one averaging time differ in the skewness of their responses.  The model has none beyond
+    that of a second-order filter, and shares the delay between filter and clock accordingly: only the sum is certain.
+    """
+    names = {finding.name for finding in findings}
+    if "gyro_averaging" not in names:
+        return list(findings)
+    return [
+        replace(finding, rivals=(*finding.rivals, Rival("gyro_lowpass", finding.held_out.after)))
+        if finding.name in OFFSETS and "gyro_lowpass" not in {rival.name for rival in finding.rivals}
+        else finding
+        for finding in findings
+    ]
 
 
 def _or_exposure(finding: Finding) -> Finding:

@@ -11,9 +11,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
-from virest.diagnosis.ambiguities import as_exposure, exposure_hypothesis, merged, offset_as_timestamp
+from virest.diagnosis.ambiguities import (
+    as_exposure,
+    exposure_hypothesis,
+    merged,
+    offset_as_timestamp,
+    offset_beside_averaging,
+)
 from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.field.blur import blur_field
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
@@ -208,9 +215,11 @@ class DiagnosisSession:
             self.geometric = self.points.climbed(progress)
         self.geometric = self._with_fields(self.light.profile)
         self.light = with_exposure_of(self.light, self.geometric.model.profile)
-        self.findings = offset_as_timestamp(
-            self.geometric, findings_of(self.geometric), self.points.observed.exposure_s
-        )
+        self.findings = self._of_points(self.points.observed.exposure_s)
+
+    def _of_points(self, exposure_s: Array) -> list[Finding]:
+        found = offset_as_timestamp(self.geometric, findings_of(self.geometric), exposure_s)
+        return offset_beside_averaging(found)
 
     def judge_blur(self, gray: Reader, progress: Callable[[float], None]) -> None:
         """Judge blur unless point residuals are significant; blur distinguishes a wrong exposure from a time offset."""
@@ -230,7 +239,7 @@ class DiagnosisSession:
             exposure = as_exposure(self.findings, change)
             points = replace(self.points, start=self.points.start.with_shutter(exposure_scale=change.estimate))
             self.geometric = points.described(points.climbed(progress), self.light.profile)
-            self.findings = [exposure, *offset_as_timestamp(self.geometric, findings_of(self.geometric), exposure_s)]
+            self.findings = [exposure, *self._of_points(exposure_s)]
         if any(finding.name == "exposure_time" for finding in self.findings):  # the points determined it better
             self.blur.findings = [finding for finding in self.blur.findings if finding.name != "exposure_time"]
             is_exposure = True
