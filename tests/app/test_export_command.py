@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -264,6 +265,20 @@ def test_fields_are_applied_or_noted(walk, tmp_path):
     first_s = (after.stamp_0_ns - start_ns) / 1e9
     (scale,) = own.extensions.field
     np.testing.assert_allclose(scale.at_time(0.3)[0], 0.02 * profile.imu_time_s(first_s + 0.3), atol=1e-5)
+
+
+def test_samples_are_corrected_for_crooked_axes(walk, tmp_path):
+    """The exported samples with the exported profile give the rates of the recorded ones with the given profile."""
+    profile = replace(read_profile(walk / "camera.yaml"), gyro_scale=(1.05, 1.0, 0.9), gyro_bias_rad_s=(0.02, 0.0, 0.0))
+    profile = profile.with_extensions(gyro_misalignment_rad=(0.03, -0.02, 0.01))
+    config = tmp_path / "crooked.yaml"
+    config.write_text(format_profile(profile))
+    folder, _ = export(walk, tmp_path, format="euroc", config=config)
+    before, after = read_capture(walk), read_capture(folder)
+    own, _ = resolve_profile(after)
+    assert own.extensions.gyro_misalignment_rad == (0.0, 0.0, 0.0)
+    true = profile.true_rate_rad_s(before.imu.gyro_rad_s)
+    np.testing.assert_allclose(own.true_rate_rad_s(after.imu.gyro_rad_s), true[: len(after.imu)], atol=1e-6)
 
 
 def test_a_clock_that_wanders_moves_samples_and_no_frame(walk, tmp_path):

@@ -306,8 +306,9 @@ def _written_profile(profile: CameraProfile, instants_s: Array, options: ExportO
     known = profile.time_offset_s is not None
     estimates = {k: v for k, v in profile.estimates.items() if k not in ("time_offset_s", "clock_skew")}
     trusted = replace(profile, imu_untrusted_s=profile.unbridged_s)
+    corrected = trusted.with_fields([field for field in profile.fields if field.kind != "rate"])
     written = replace(
-        on_camera_clock(trusted.with_fields([field for field in profile.fields if field.kind != "rate"])),
+        on_camera_clock(corrected.with_extensions(gyro_misalignment_rad=(0.0, 0.0, 0.0))),
         shutter=shutter,
         readout_known=profile.readout_known or options.restored is not None,
         time_offset_s=offset_s if known else None,
