@@ -6,6 +6,7 @@ The diagnosis reads only the capture folder; the hidden effect is stated in trut
 from __future__ import annotations
 
 import json
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +86,10 @@ def errors_in_std(found: Diagnosis, name: str, truth: dict[str, Any]) -> list[fl
     for cause in found.causes:
         if cause.name != name:
             continue
+        parts = iter(truth.values())
         for key, change in cause.parameters.items():
-            true = list(truth.values()) if isinstance(change.estimate, list) and key not in truth else truth.get(key)
+            of_vector = isinstance(change.estimate, list) and key not in truth
+            true = list(islice(parts, len(change.estimate))) if of_vector else truth.get(key)
             if change.std in (None, 0) or true is None or isinstance(true, str):
                 continue
             estimate, std, true = (np.atleast_1d(np.array(v, float)) for v in (change.estimate, change.std, true))
