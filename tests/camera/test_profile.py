@@ -169,7 +169,12 @@ def _profiles(draw: st.DrawFn) -> CameraProfile:
         gyro_scale=some(0.1, 2, 3),  # type: ignore[arg-type]
         response=draw(st.sampled_from([None, curve])),
         depth_m=draw(st.one_of(st.none(), st.just(math.inf), _floats(0.01, 1e4))),
-        extensions=replace(FULL.extensions, gain=some(0.1, 3, draw(st.integers(0, 5)))),
+        extensions=replace(
+            FULL.extensions,
+            gain=some(0.1, 3, draw(st.integers(0, 5))),
+            gyro_averaging_s=draw(st.floats(0, 0.9)),
+            gyro_misalignment_rad=some(-0.4, 0.4, 3),  # type: ignore[arg-type]
+        ),
     )
 
 
@@ -358,6 +363,9 @@ WRONG = {
     "direction": "shutter: {readout_direction: up}",
     "stamp": "shutter: {timestamp: 17}",
     "two biases": "imu: {gyro_bias_rad_s: [0, 0]}",
+    "gyroscope axes in one plane": "extensions: {gyro_misalignment_rad: [0.9, 0, 0]}",
+    "two misalignments": "extensions: {gyro_misalignment_rad: [0.01, 0]}",
+    "averaging in ms": "extensions: {gyro_averaging_s: 12}",
     "text in bias": "imu: {gyro_bias_rad_s: [0, 0, x]}",
     "skew": "imu: {clock_skew: 2}",
     "zero gyro scale": "imu: {T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]], gyro_scale: [1, 0, 1]}",

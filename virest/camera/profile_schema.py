@@ -35,6 +35,8 @@ Depth = Annotated[float, BeforeValidator(_number), Field(gt=0)]
 Positive = Annotated[Number, Field(gt=0, lt=1e9)]
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Misalignment = Annotated[list[Annotated[Number, Field(gt=-0.5, lt=0.5)]], Field(min_length=3, max_length=3)]
+"""From 0.5 on, three axes may lie in one plane."""
 
 
 class _Strict(BaseModel):
@@ -189,7 +191,7 @@ class ExtensionsBlock(_Strict):
     defocus: _Defocus = _Defocus()
     gyro_lowpass_hz: Annotated[Number, Field(ge=0, lt=1e6)] = 0.0
     gyro_averaging_s: Annotated[Number, Field(ge=0, lt=1)] = 0.0
-    gyro_misalignment_rad: Triple = [0.0, 0.0, 0.0]
+    gyro_misalignment_rad: Misalignment = [0.0, 0.0, 0.0]
     field: Annotated[list[FieldBlock], Field(max_length=500)] = []
 
 

@@ -60,8 +60,9 @@ RIVAL_T = 2.0
 EQUAL_T = 0.25
 """Two ends of the ladder are equally good below this many standard errors."""
 SIMPLER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length", "gyro_averaging": "gyro_scale"}
-"""For slow rotations a low-pass filter is a delay; along one image direction a pixel aspect is a focal length.  Where
-the points cannot distinguish the two, the simpler cause is reported, with the other as its rival."""
+"""For slow rotations a low-pass filter is a delay; along one image direction a pixel aspect is a focal length; for
+rotations of one frequency averaging is a scale.  Where the points cannot distinguish the two, the simpler cause is
+reported, with the other as its rival."""
 MAX_RUNGS = 5
 """Causes, or pairs of them, that may enter: a limit on time.  A rung with six of them to try takes 0.3 s."""
 
