@@ -262,16 +262,21 @@ def test_crooked_axes_read_parts_of_each_other_and_are_corrected():
     np.testing.assert_allclose(profile.true_rate_rad_s(reading), turn, atol=1e-12)
 
 
-@pytest.mark.parametrize(("corner_hz", "averaging_s"), [(12.0, 0.0), (0.0, 0.008), (20.0, 0.006)])
-def test_a_filter_can_be_inverted(rng, corner_hz, averaging_s):
-    """Inverting the filters brings a hand's rates 40 times closer to the true ones than the log."""
+@pytest.mark.parametrize(
+    ("corner_hz", "averaging_s", "left"), [(12.0, 0.0, 0.02), (20.0, 0.006, 0.02), (0.0, 0.012, 0.03)]
+)
+def test_a_filter_can_be_inverted(rng, corner_hz, averaging_s, left):
+    """Inverting the filters leaves a part of what they change in a hand's rates.
+
+    Without a delay they change less: at |H| = 0.85 the regularised inverse is 0.4 % too small, of 15 % that are lost.
+    """
     motion = random_hand_motion(rng, rate_rms_rad_s=1.0, duration_s=2.0, band_hz=(0.5, 8.0))
     time_s, window_s = np.arange(-0.5, 2.5, 0.005), averaging_window_s(averaging_s)
     corners_hz = [corner_hz] if corner_hz else []
     true, logged = motion.rate_rad_s(time_s), filtered_rate(motion.rate_rad_s, time_s, corners_hz, window_s=window_s)
     found = before_filter(time_s, logged, corner_hz, window_s)
     inner = slice(60, -60)
-    assert np.std((found - true)[inner]) < 0.025 * np.std((logged - true)[inner])
+    assert np.std((found - true)[inner]) < left * np.std((logged - true)[inner])
 
 
 def test_a_shadow_covers_its_place_at_its_time():

@@ -5,8 +5,8 @@ and σ² the variance.  A second-order Butterworth filter of cutoff f has τ = �
 3 dB at f, maximally flat below (Butterworth 1930, "On the theory of filter amplifiers").  Filters of phones' sensors
 are of this order and flat (InvenSense MPU-6050 register map, DLPF_CFG; Bosch BMI160 data sheet, gyroscope's cutoffs).
 A first-order filter has σ = τ, exactly; two equal ones in series σ = τ / √2, exactly; the mean over a window W has
-σ = W / √12, and no delay where its timestamps mark the window's middle.  No filter that only knows the past has σ > τ;
-there, the surplus of σ² is taken for such a mean, of response sin(πfW) / (πfW), whose timestamps were corrected.
+σ = W / √12, and no delay where its timestamps mark the window's middle.  No stable filter of second order has σ > τ:
+there, the surplus of σ² is taken for such a mean, of response sin(πfW) / (πfW).
 
 With σ = 0 the first terms are those of e^{τs}.  For motion well below f a flat filter is therefore a delay by τ; only
 the terms (2π f_rate τ)³/6 of the phase and (f_rate / f)⁴/2 of the amplitude distinguish it from a time offset.

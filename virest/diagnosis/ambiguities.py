@@ -17,6 +17,7 @@ from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.tracking_stage import with_flicker_of
 
 OFFSETS = frozenset({"time_offset", "timestamp_reference"})
+"""Causes that shift all rows of the frames by one time, as the delay of a gyroscope's filter does."""
 COINCIDENCE_SIGMA, COINCIDENCE_PART = 3.5, 0.25
 """An offset is attributed to another timestamp reference if it agrees within this many standard deviations and within
 this part of the reference's own shift: a deviation that an unmodelled effect has widened agrees with everything."""

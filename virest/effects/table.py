@@ -43,7 +43,7 @@ def _second_relative(value: Any, std: Array) -> float:
 
 
 def _of_axes(value: Any, std: Array) -> list[float]:
-    """Deviations of three relative scales, of which two are steps and the third balances them."""
+    """Deviations of three relative scales: two are steps, and the third balances them, as if these were independent."""
     steps = (*std[:2], float(np.hypot(*std[:2])))
     return [float(s) * abs(float(v)) for s, v in zip(steps, value, strict=True)]
 

@@ -111,7 +111,7 @@ def forms_of_pairs(
         assert log is not None
         drawn = _zero("scale", ("radius", "focus"), [radii, np.array(dioptres)], None, log)
         forms.append(_product((drawn,), outwards, np.array(log[1]), LENSES, known))
-    reaches = [np.array([-reach, reach]) for reach in _reaches(capture.imu, profile)]
+    reaches = [np.array([-reach, reach]) for reach in _reaches(profile.true_rate_rad_s(capture.imu.gyro_rad_s))]
     rates = tuple(_zero("rate", (name, TIME), [ends, times], stamp) for name, ends in zip(RATES, reaches, strict=True))
     odd = [np.array([[-1.0], [1.0]]) / np.sqrt(2)] * 3
     return [*forms, _product(rates, odd, None, GYROS, known)]
@@ -147,10 +147,9 @@ def _with_knots(field: Field, count: int) -> Field:
     )
 
 
-def _reaches(imu: ImuSamples, profile: CameraProfile, part: float = 1.0) -> list[float]:
-    """Quantile ``part`` of the absolute corrected rate on the 3 axes, rad/s."""
-    reading = profile.true_rate_rad_s(imu.gyro_rad_s)
-    return [max(float(most), LEAST_REACH_RAD_S) for most in np.quantile(np.abs(reading), part, axis=0)]
+def _reaches(rate_rad_s: Array, part: float = 1.0) -> list[float]:
+    """Quantile ``part`` of the absolute rates (n, 3) on the 3 axes, rad/s."""
+    return [max(float(most), LEAST_REACH_RAD_S) for most in np.quantile(np.abs(rate_rad_s), part, axis=0)]
 
 
 def _times(span_s: tuple[float, float], step_s: float, most: int) -> Array:
@@ -301,13 +300,13 @@ def _fine_rate_form(
 ) -> FieldForm:
     """The same with more knots near rest, where a gyroscope may stick, and without the flatness constraint.
 
-    If a gyroscope scale is in the model, the part proportional to the readings is left to it.
+    If scales of the gyroscope are in the model, the part proportional to the readings is left to them.
     """
 
     def conditions(knots: tuple[float, ...], reading: Array) -> Array:
         at = cardinal_weights(knots, 0.0)
         mean = reading @ cardinal_weights(knots, reading) / float(reading @ reading)
-        return np.stack([at, mean] if "gyro_scale" in known else [at])
+        return np.stack([at, mean] if {"gyro_scale", "gyro_axes"} & known else [at])
 
     def again(count: int) -> Recipe:
         return lambda _profile, now: _fine_rate_form(imu, profile, now, count)
@@ -326,14 +325,13 @@ def _over_rates(
 
     conditions: rows of linear constraints on the knot values.
     """
-    fields, bases = [], []
-    for axis, (name, reach) in enumerate(zip(RATES, _reaches(imu, profile, part), strict=True)):
-        reading = profile.true_rate_rad_s(imu.gyro_rad_s)[:, axis]
+    fields, bases, readings = [], [], profile.true_rate_rad_s(imu.gyro_rad_s)
+    for axis, (name, reach) in enumerate(zip(RATES, _reaches(readings, part), strict=True)):
         field = _zero("rate", (name,), [steps * reach])
         own = np.zeros((3, 1))
         own[axis] = 1.0
         fields.append(field)
-        bases.append(np.kron(null_space(conditions(field.knots[0], reading)), own))
+        bases.append(np.kron(null_space(conditions(field.knots[0], readings[:, axis])), own))
     return FieldForm(tuple(fields), block_diag(*bases))
 
 
