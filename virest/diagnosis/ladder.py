@@ -28,6 +28,7 @@ from virest.diagnosis.field.brightness import instead_of_cause, light_field, wit
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
+from virest.diagnosis.followed_log import with_followed_log
 from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
@@ -268,7 +269,8 @@ class DiagnosisSession:
         assert self.blur is not None
         assert self.curve is not None
         causes = [*self.findings, *self.blur.findings]
-        self.light, profile = settle_light(self.light, self.curve, self.points.start, causes)
+        light, profile = settle_light(self.light, self.curve, self.points.start, causes)
+        self.light = with_followed_log(light, self.capture.frames, self.each)
         self.curve = replace(self.curve, profile=profile)
 
     def judge_edges(self, gray: Reader) -> None:

@@ -157,7 +157,46 @@ class GainDrift:
         return profile.with_extensions(gain=tuple((gain / np.median(gain)).tolist()))
 
 
-PhotometricEffect = OneValue | Flicker | GainDrift
+@dataclass(frozen=True, eq=False)
+class FollowedGain:
+    """Log gains of frames as a linear function of some numbers: along something that is logged."""
+
+    basis: Array
+    """(movie frames, k) log gain of each frame per number."""
+    start: Array
+    """(k,) the numbers from which a fit starts."""
+    name: str = "gain_drift"
+    per_frame: bool = False
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """One per number."""
+        return tuple(f"log_gain[{k}]" for k in range(self.basis.shape[1]))
+
+    @property
+    def scale(self) -> Array:
+        """0.1 in log light."""
+        return np.full(self.basis.shape[1], 0.1)
+
+    @property
+    def bounds(self) -> Bounds:
+        """Unbounded."""
+        return (-np.inf,) * self.basis.shape[1], (np.inf,) * self.basis.shape[1]
+
+    def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
+        """The given one."""
+        return [self.start]
+
+    def columns(self, observations: PhotometricObservations) -> Array:
+        """(n, k) derivative of the log light factor with respect to the values."""
+        return np.asarray(self.basis[observations.frame])
+
+    def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
+        """Set extensions.gain."""
+        return profile.with_extensions(gain=tuple(np.exp(np.clip(self.basis @ values, -3.0, 3.0)).tolist()))
+
+
+PhotometricEffect = OneValue | Flicker | GainDrift | FollowedGain
 """One named effect on brightness: its parameters, and their places in a profile."""
 
 

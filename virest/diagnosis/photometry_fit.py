@@ -17,7 +17,13 @@ from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import PHOTOMETRY, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, normalised_rms, predict
-from virest.diagnosis.photometry_effects import SEARCH_HZ, GainDrift, PhotometricEffect, flicker_change
+from virest.diagnosis.photometry_effects import (
+    SEARCH_HZ,
+    FollowedGain,
+    GainDrift,
+    PhotometricEffect,
+    flicker_change,
+)
 from virest.effects.table import EFFECTS
 from virest.inference.chance import chi2_tail, normal_deviate
 from virest.inference.clustered import raised, scatter
@@ -333,7 +339,7 @@ class _Brightness:
         slope, noise = np.zeros((len(weight), len(values))), self.observations.noise
         steps = np.append(np.zeros(len(values) - 1), _MEMORY_STEP)
         for effect, own in _parts(self.effects):
-            if isinstance(effect, GainDrift):
+            if isinstance(effect, GainDrift | FollowedGain):
                 columns = effect.columns(self.observations)
                 slope[:, own] = -self.predicted(values, weight).respond(columns) / noise[:, None]
             else:
