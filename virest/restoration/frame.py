@@ -28,6 +28,7 @@ from virest.restoration.encoding import encode_picture
 from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_harms, straightening_harms
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, static_part
+from virest.restoration.neighbours.own_motion import own_motion
 from virest.restoration.neighbours.refinement import RefinedMotion, unrefined_path_std_px
 from virest.restoration.parameters import (
     Deblurring,
@@ -300,8 +301,13 @@ def _deblurred(
     blurred = blurred_picture(picture, curve, (measured.luma, measured.chroma), measured.field, blur.longest_px)
     together = neighbours is not None and blur.anchor == 0.5
     found = neighbours(measured.luma, measured.field) if together and neighbours is not None else ()
+    if (own := own_motion(found)) is not None:
+        found = own.of_neighbours(found)
+        blurred = replace(blurred, field=own.kernels(blurred.field, blur.motion.exposure_s))
     joined = joined_neighbours(found, measured.luma_model)
     longest_px = max((blur.longest_px, *(one.longest_px for one in joined.registrations)))
+    if own is not None:
+        longest_px = max(longest_px, float(blurred.field(own.tiles_px).length_px.max()))
     blurred = replace(blurred, spread=measured.spread, neighbours=joined.pictures, longest_px=longest_px)
     recorded = picture
     if light is not None:

@@ -80,7 +80,7 @@ class ShiftField:
 
     def at(self, points_px: Array) -> Array:
         """The shift at points (..., 2)."""
-        return _at(self.affine, points_px) + _between_tiles(self.rest_px, self.centres_px, points_px)
+        return _at(self.affine, points_px) + between_tiles(self.rest_px, self.centres_px, points_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +107,10 @@ class NeighbourRegistration:
     """Where the neighbour has unclipped pixels, at the reduced size."""
     std_px: Array
     """(n,) standard deviation of the registration in those tiles, per axis."""
+    own_shift_px: Array
+    """(n, 2) each tile's own shift; NaN where the neighbour shows something else."""
+    apart_s: Array
+    """(n,) time from the frame's to the neighbour's observation of those tiles."""
     coding_noise_ratio: float = 1.0
     """The frame's coding noise over the neighbour's: above 1 if the neighbour was coded with a finer step."""
     spread: KernelSpread | None = None
@@ -133,7 +137,7 @@ class NeighbourRegistration:
 
     def std_at_px(self, centres_px: Array) -> Array:
         """(m,) registration deviation at points (m, 2), interpolated between the nearest four tiles."""
-        return np.sqrt(_between_tiles(np.square(self.std_px), self.centres_px, centres_px))
+        return np.sqrt(between_tiles(np.square(self.std_px), self.centres_px, centres_px))
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +171,9 @@ def register_neighbour(
     height, width = trust.shape
     seen = (agreement.inside & ~agreement.clipped)[:height, :width]
     return NeighbourRegistration(
-        number, view, shift, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px
-    )
+        number, view, shift, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px,
+        np.where(used[:, None], agreement.shift_px, np.nan), view.apart_s(agreement.centres_px),
+    )  # fmt: skip
 
 
 def resample_neighbour(
@@ -374,7 +379,7 @@ def _likeliest_field(off_px: Array, doubt: Array, apart: Array) -> tuple[float, 
     return float(np.sqrt(part * power)), float(np.sqrt((1 - part) * power)), reach
 
 
-def _between_tiles(values: Array, tiles_px: Array, points_px: Array) -> Array:
+def between_tiles(values: Array, tiles_px: Array, points_px: Array) -> Array:
     """Values (n,) or (n, 2) at the centres of a grid of tiles, interpolated linearly at points (..., 2)."""
     x, y = (np.unique(along) for along in tiles_px.T)
     grid = values.reshape(len(y), len(x), -1).astype(np.float32)

@@ -1,0 +1,77 @@
+"""Blur of what moves on its own: people, vehicles, and near things that a rotation does not describe.
+
+Content that the neighbours show at other places than predicted also moved during the exposures, at the same speed: the
+blur path is the predicted one plus the speed times the time since the anchor.  With the predicted kernel alone a person
+who walks through the picture rings.  Two or more neighbours tell a speed from noise, since their shifts must grow with
+the time between the frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from virest.arrays import Array
+from virest.image_formation.kernels import KernelField
+from virest.restoration.neighbours.joint import NeighbourPicture, NeighbourRegistration, between_tiles
+
+
+@dataclass(frozen=True, slots=True)
+class OwnMotion:
+    """Speed of the content against the predicted motion."""
+
+    tiles_px: Array
+    """(n, 2) centres of a grid of tiles."""
+    speed_px_s: Array
+    """(n, 2) shrunk towards 0 by its uncertainty."""
+
+    def kernels(self, field: Callable[[Array], KernelField], exposure_s: float) -> Callable[[Array], KernelField]:
+        """Kernels of a picture with this exposure, with the speed in their paths.
+
+        At a time t after the anchor, a pixel shows what lay a path of speed · t further back.
+        """
+
+        def moving(centres_px: Array) -> KernelField:
+            predicted = field(centres_px)
+            samples = predicted.paths_px.shape[1]
+            since_s = exposure_s * ((np.arange(samples) + 0.5) / samples - predicted.anchor)
+            speed_px_s = between_tiles(self.speed_px_s, self.tiles_px, centres_px)
+            return replace(predicted, paths_px=predicted.paths_px - since_s[:, None] * speed_px_s[:, None])
+
+        return moving
+
+    def of_neighbours(self, found: Sequence[NeighbourPicture]) -> tuple[NeighbourPicture, ...]:
+        """The neighbours with the speed in their kernels: it is the same in all frames."""
+        return tuple(replace(one, registration=self._moving(one.registration)) for one in found)
+
+    def _moving(self, one: NeighbourRegistration) -> NeighbourRegistration:
+        return replace(one, field=self.kernels(one.field, one.view.neighbour.exposure_s))
+
+
+def own_motion(found: Sequence[NeighbourPicture]) -> OwnMotion | None:
+    """The speeds of the tiles that two or more neighbours show; None where no tile is seen that often.
+
+    The speed is the least-squares slope of a tile's shifts over the times between the frames.  Its variance follows
+    from what that leaves, in this tile or in the median of all, whichever is more: few shifts hardly show their
+    scatter.  The speed is shrunk by it (James & Stein 1961).  Where a neighbour shows x + d at the predicted position
+    of x, the content of x has moved by -d.
+    """
+    registrations = [one.registration for one in found]
+    if len(registrations) < 2:
+        return None
+    shift_px = np.array([one.own_shift_px for one in registrations])
+    apart_s = np.array([one.apart_s for one in registrations])[..., None]
+    seen = np.isfinite(shift_px)
+    shift_px = np.where(seen, shift_px, 0.0)
+    lever_s2 = np.where(seen, apart_s**2, 0.0).sum(axis=0)
+    speed_px_s = -(apart_s * shift_px).sum(axis=0) / np.maximum(lever_s2, 1e-12)
+    freedom = seen.sum(axis=0) - 1
+    left_px2 = np.where(seen, (shift_px + apart_s * speed_px_s) ** 2, 0.0).sum(axis=0) / np.maximum(freedom, 1)
+    often = freedom[:, 0] > 0
+    if not often.any():
+        return None
+    variance = (np.maximum(left_px2, np.median(left_px2[often])) / np.maximum(lever_s2, 1e-12)).sum(axis=1)
+    sure = np.maximum(1 - variance / np.maximum((speed_px_s**2).sum(axis=1), 1e-12), 0.0)
+    return OwnMotion(registrations[0].centres_px, speed_px_s * (often * sure)[:, None])
