@@ -68,6 +68,9 @@ class RestorationPlan:
     undetected_rad_s: float | None = None
     """Standard deviation, per axis, of a missing rotation rate that the frames do not show; None: not measurable."""
 
+    own_px_s: float = 0.0
+    """Speed, rms per axis, of what moves on its own."""
+
     mask: UnsharpMask | None = None
     """The phone's sharpening, undone before deblurring; None: none detected."""
 
@@ -194,6 +197,7 @@ def restore_frames(
             unmasked,
             here.coding_step,
             plan.undetected_rad_s,
+            plan.own_px_s,
         )
 
 
