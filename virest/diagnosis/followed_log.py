@@ -110,14 +110,14 @@ def _followed(
         if cause != "gain_drift" and form.name == TIME:  # a slow drift beside a changing exposure is no curve
             continue
         effect = FollowedGain(form.basis, np.asarray(np.linalg.lstsq(form.basis[seen.frames], log_gain)[0]))
+        fit = fit_photometry(seen, without, [effect])
+        if fit.rms**2 > most_left:
+            continue
+        if form.frames_off and abs(float(fit.values[0]) - 1) > max(ONE, 2 * float(fit.std[0])):
+            continue
         held = judge(seen, without, [effect], each, by_side=True)
         if held.after**2 > most_left:
             continue
-        fit = fit_photometry(seen, without, [effect])
-        if form.frames_off:
-            off, std = abs(float(fit.values[0]) - 1), float(fit.std[0])
-            if off > max(ONE, 2 * std):
-                continue
         shape = curve_shape(form.along @ fit.values, form.name) if len(form.along) else ""
         found.append(_Followed(form, shape, held))
     return sorted(found, key=lambda one: one.held_out.after)
