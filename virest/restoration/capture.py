@@ -180,9 +180,8 @@ def restore_frames(
         refined, pictures = None, None
         if neighbours is not None:
             refined = neighbours.refined(before, here, after)
-            pictures = partial(
-                neighbours.pictures, plan.joined(before, after), here, refined, plan.settings.most_joined
-            )
+            if joined := plan.joined(before, after):
+                pictures = partial(neighbours.pictures, joined, here, refined, plan.settings.most_joined)
         unmasked = None if here.recorded is None else here.picture
         yield restore_frame(
             frame,

@@ -134,7 +134,7 @@ def restore_frame(
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
         own_path_px, own_position_px = own_motion_std_px(own_px_s, motion)
-        if neighbours is None or not settings.neighbours:
+        if neighbours is None or anchor != 0.5:
             covariance_px2 = covariance_px2 + own_path_px**2 * np.eye(2)
         position_std_px = refined.position_std_px() if refined is not None and straighten else 0.0
         if straighten:  # the rows of what moves on its own are not moved to the reference time
