@@ -17,6 +17,9 @@ from virest.arrays import Array
 from virest.image_formation.kernels import KernelField
 from virest.restoration.neighbours.joint import NeighbourPicture, NeighbourRegistration, between_tiles
 
+FALSE_ALARM = 1e-3
+"""Probability of a speed in a tile that has none."""
+
 
 @dataclass(frozen=True, slots=True)
 class OwnMotion:
@@ -25,7 +28,7 @@ class OwnMotion:
     tiles_px: Array
     """(n, 2) centres of a grid of tiles."""
     speed_px_s: Array
-    """(n, 2) shrunk towards 0 by its uncertainty."""
+    """(n, 2); 0 where noise explains it."""
 
     def kernels(self, field: Callable[[Array], KernelField], exposure_s: float) -> Callable[[Array], KernelField]:
         """Kernels of a picture with this exposure, with the speed in their paths.
@@ -55,8 +58,8 @@ def own_motion(found: Sequence[NeighbourPicture]) -> OwnMotion | None:
 
     The speed is the least-squares slope of a tile's shifts over the times between the frames.  Its variance follows
     from what that leaves, in this tile or in the median of all, whichever is more: few shifts hardly show their
-    scatter.  The speed is shrunk by it (James & Stein 1961).  Where a neighbour shows x + d at the predicted position
-    of x, the content of x has moved by -d.
+    scatter.  A speed that noise reaches in FALSE_ALARM of the tiles counts as 0, and a larger one loses less.  Where a
+    neighbour shows x + d at the predicted position of x, the content of x has moved by -d.
     """
     registrations = [one.registration for one in found]
     if len(registrations) < 2:
@@ -73,5 +76,6 @@ def own_motion(found: Sequence[NeighbourPicture]) -> OwnMotion | None:
     if not often.any():
         return None
     variance = (np.maximum(left_px2, np.median(left_px2[often])) / np.maximum(lever_s2, 1e-12)).sum(axis=1)
-    sure = np.maximum(1 - variance / np.maximum((speed_px_s**2).sum(axis=1), 1e-12), 0.0)
+    by_chance = -np.log(FALSE_ALARM) * variance  # squared length of a speed that is noise: chi-square of two freedoms
+    sure = np.maximum(1 - by_chance / np.maximum((speed_px_s**2).sum(axis=1), 1e-12), 0.0)
     return OwnMotion(registrations[0].centres_px, speed_px_s * (often * sure)[:, None])
