@@ -31,7 +31,6 @@ FIGURE = re.compile(
     r"([-+−]?\d[\d,.]*)(?:(?:\s(?:to|and|or)\s|–)([-+−]?\d[\d,.]*))?\s?(?:dB|px|frames/s|°|mm|MB|%)(?!\w)"
 )
 SETTINGS = {
-    "0.35 px": "LEAST_OWN_PX: the path error by content that moves on its own that counts",
     "0.1 dB": "MIN_GAIN_DB: the least gain by the spectra for which frames are deblurred",
     "0.5 dB": "LEAST_CONFIRMED_DB: the least predicted gain for which frames are deblurred",
     "0.05 dB": "bench --compare: what counts as a change",

@@ -68,9 +68,6 @@ class RestorationPlan:
     undetected_rad_s: float | None = None
     """Standard deviation, per axis, of a missing rotation rate that the frames do not show; None: not measurable."""
 
-    own_px_s: float = 0.0
-    """Speed, rms per axis, of what moves on its own."""
-
     mask: UnsharpMask | None = None
     """The phone's sharpening, undone before deblurring; None: none detected."""
 
@@ -180,8 +177,9 @@ def restore_frames(
         refined, pictures = None, None
         if neighbours is not None:
             refined = neighbours.refined(before, here, after)
-            if joined := plan.joined(before, after):
-                pictures = partial(neighbours.pictures, joined, here, refined, plan.settings.most_joined)
+            pictures = partial(
+                neighbours.pictures, plan.joined(before, after), here, refined, plan.settings.most_joined
+            )
         unmasked = None if here.recorded is None else here.picture
         yield restore_frame(
             frame,
@@ -196,7 +194,6 @@ def restore_frames(
             unmasked,
             here.coding_step,
             plan.undetected_rad_s,
-            plan.own_px_s,
         )
 
 

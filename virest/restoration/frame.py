@@ -29,7 +29,7 @@ from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_
 from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, static_part
 from virest.restoration.neighbours.own_motion import own_motion
-from virest.restoration.neighbours.refinement import RefinedMotion, own_motion_std_px, unrefined_path_std_px
+from virest.restoration.neighbours.refinement import RefinedMotion, unrefined_path_std_px
 from virest.restoration.parameters import (
     Deblurring,
     DegradationParameters,
@@ -101,7 +101,6 @@ def restore_frame(
     unmasked: NDArray[np.uint8] | None = None,
     coding_step: float | None = None,
     undetected_rad_s: float | None = None,
-    own_px_s: float = 0.0,
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten with one warp; steps that would not help are skipped, with a warning.
 
@@ -111,7 +110,6 @@ def restore_frame(
     frames for joint restoration and registers them.  unmasked: the picture with the phone's sharpening undone, to be
     deblurred; None: ``picture`` itself.  coding_step: the coder's quantiser step, grey levels; None: unknown.
     undetected_rad_s: standard deviation of the rotation rate of a motion that neighbours did not refine; None: unknown.
-    own_px_s: speed, rms per axis, of what moves on its own: without neighbours, which show it, all paths are uncertain.
     """
     clock = _Clock()
     if refined is not None:
@@ -133,12 +131,7 @@ def restore_frame(
     deblurring: Deblurring | None = None
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
-        own_path_px, own_position_px = own_motion_std_px(own_px_s, motion)
-        if neighbours is None or anchor != 0.5:
-            covariance_px2 = covariance_px2 + own_path_px**2 * np.eye(2)
         position_std_px = refined.position_std_px() if refined is not None and straighten else 0.0
-        if straighten:  # the rows of what moves on its own are not moved to the reference time
-            position_std_px = float(np.hypot(position_std_px, own_position_px))
         path_std_px = None
         if refined is not None:
             path_std_px = float(np.sqrt(np.trace(covariance_px2) / 2))

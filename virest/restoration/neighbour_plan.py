@@ -48,7 +48,7 @@ def with_neighbour_survey(
         sights[number] = Sight(frames[number], luma, motion, why, coding_step=steps.get(number))
     plan, sights = _without_sharpening(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
-    missing, undetected_rad_s, own_px_s = survey_turns(runs, sights, neighbours, trajectory)
+    missing, undetected_rad_s = survey_turns(runs, sights, neighbours, trajectory)
     if undetected_rad_s is None and plan.points_off_rad_s is not None:
         missing = unmeasured_turn(plan.points_off_rad_s)
     elif missing is not None:
@@ -57,13 +57,13 @@ def with_neighbour_survey(
             "each frame's motion is corrected by its neighbours"
         )
         plan = replace(plan, notes=(*plan.notes, note))
-    plan = replace(plan, missing_turn=missing, undetected_rad_s=undetected_rad_s, own_px_s=own_px_s)
+    plan = replace(plan, missing_turn=missing, undetected_rad_s=undetected_rad_s)
     if plan.settings.deblur == "none":
         return plan
     quick = replace(PRESETS["fast"], min_blur_px=plan.settings.min_blur_px)
 
     def restore_quickly(here: Sight, motion: RowMotion, refined: RefinedMotion | None) -> tuple[Image, Image] | None:
-        return try_restoration(here.picture, motion, quick, refined, here.coding_step, own_px_s)
+        return try_restoration(here.picture, motion, quick, refined, here.coding_step)
 
     return replace(
         plan,

@@ -16,7 +16,7 @@ from virest.image_formation.row_motion import RowMotion
 from virest.restoration.blurred import blurred_picture
 from virest.restoration.frame import deblur_method
 from virest.restoration.neighbours.reduced_tiles import reduced
-from virest.restoration.neighbours.refinement import RefinedMotion, own_motion_std_px
+from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, measured_centres, picture_statistics
 from virest.restoration.statistics.tile_power import FEW_TILES
@@ -34,7 +34,6 @@ def try_restoration(
     settings: RestorationSettings,
     refined: RefinedMotion | None,
     coding_step: float | None,
-    own_px_s: float = 0.0,
 ) -> tuple[Image, Image] | None:
     """Restore a luma (height, width); None if it would not be deblurred.
 
@@ -50,9 +49,7 @@ def try_restoration(
     curve, field = motion.profile.curve, smooth_field(motion, ANCHOR)
     measured_px = measured_centres(luma, motion, coding_step)
     statistics = picture_statistics(luma, field(measured_px), curve, FEW_TILES, coding_step)
-    covariance_px2 = own_motion_std_px(own_px_s, motion)[0] ** 2 * np.eye(2)
-    if refined is not None:
-        covariance_px2 = covariance_px2 + refined.path_covariance_px2()
+    covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
     spread = kernel_spread(field, width, height, covariance_px2)
     model = statistics[0].with_kernel_variance(spread)
     if no_gain_reason(model, model.expected_gain_db):

@@ -18,7 +18,6 @@ from virest.evaluation.fidelity import psnr_db
 from virest.image_formation.kernels import KernelField
 from virest.restoration.capture import RestorationPlan
 from virest.restoration.neighbours.own_motion import OwnMotion, own_motion
-from virest.restoration.neighbours.refinement import own_motion_std_px
 from virest.restoration.settings import PRESETS
 
 Array = NDArray[np.float64]
@@ -105,30 +104,3 @@ def test_frames_gain_where_all_content_moves_otherwise(tmp_path: Path, monkeypat
 def quality_db(capture: TrueCapture, plan: RestorationPlan) -> Array:
     """PSNR of each restored frame."""
     return np.array([psnr_db(r.picture, capture.truth(r.frame.index), r.valid_px) for r in capture.restored(plan)])
-
-
-def test_without_neighbours_much_own_motion_makes_paths_uncertain() -> None:
-    """A passing bus does, the usual scatter of tiles does not; rows lie off by the speed times their time."""
-    motion = SimpleNamespace(
-        exposure_s=0.02, reference_s=1.0, profile=SimpleNamespace(width=640, height=480),
-        row_time_s=lambda _points_px, _share: np.array([0.99, 1.01]),
-    )  # fmt: skip
-    path_px, position_px = own_motion_std_px(130.0, motion)  # type: ignore[arg-type]
-    assert path_px == pytest.approx(2.6)
-    assert position_px == pytest.approx(130.0 * 0.01 / np.sqrt(3))
-    assert own_motion_std_px(10.0, motion) == (0.0, 0.0)  # type: ignore[arg-type]
-
-
-@pytest.mark.scenario
-def test_objects_that_move_show_between_two_frames(tmp_path: Path) -> None:
-    """Their tiles' speed exceeds the scatter; in a static scene it hardly does."""
-    found = []
-    for name, speed_px_s in (("still", 0.0), ("moving", 240.0)):
-        simulate_command(
-            tmp_path / name, width=320, height=384, focal_px=350.0, exposure_ms=14.0, rate_rad_s=1.2, frames=3, seed=35,
-            moving_px_s=speed_px_s,
-        )  # fmt: skip
-        capture = open_true_capture(tmp_path / name)
-        plan = capture.plan(PRESETS["fast"])
-        found.append(plan.own_px_s)
-    assert found[1] > 3 * found[0]

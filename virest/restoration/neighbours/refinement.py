@@ -26,9 +26,6 @@ FALSE_ALARM = 1e-3
 NEGLIGIBLE_PX = 0.05
 """Path error below which nothing is corrected: it spoils 0.2 % of the power at 0.5 cycles per pixel (|2πf δ|² / 12),
 less than any movie's noise.  Rows misplaced by δ rms spoil as much as a path that is √12 δ too long."""
-LEAST_OWN_PX = 0.35
-"""Path error by content that moves on its own below which all paths count as known: it spoils 10 % of the power at 0.5
-cycles per pixel (|2πf δ|² / 12)."""
 FARTHEST, MOST_SCATTERED = 5.0, 1.8
 """Reject a pair whose missing rate exceeds this many standard deviations and whose tiles scatter by this many times the
 usual: it shows something else, such as a passing bus.  By chance 16 tiles scatter that much in 1 of 1000 pairs (F
@@ -215,15 +212,6 @@ def unrefined_path_std_px(motion: RowMotion, rate_std_rad_s: float) -> float:
     """Standard deviation of a frame's blur path, per axis, at the picture's centre, for that of the rotation rate."""
     jacobian = _per_turn_px(motion)
     return float(rate_std_rad_s * motion.exposure_s * np.sqrt(np.trace(jacobian @ jacobian.T) / 2))
-
-
-def own_motion_std_px(own_px_s: float, motion: RowMotion) -> tuple[float, float]:
-    """Deviations, per axis, of the blur path's end and of the rows' positions, for content that moves on its own.
-
-    own_px_s: its speed, rms per axis.  Both are 0 if the path's is below LEAST_OWN_PX.
-    """
-    path_px = own_px_s * motion.exposure_s
-    return (path_px, own_px_s * _rms_from_reference_s(motion)) if path_px > LEAST_OWN_PX else (0.0, 0.0)
 
 
 def unmeasured_turn(rate_rad_s: float) -> MissingTurn:

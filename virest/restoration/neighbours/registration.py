@@ -72,9 +72,6 @@ class PairTurn:
     """Standard deviation, per axis, of the tiles' speeds about the fitted rotation: relief, moving objects, noise."""
     tiles: int
     """Number of tiles used."""
-    own_px_s: float = 0.0
-    """Speed, rms per axis, of tiles that move on their own: what their speeds about the rotation have beyond the
-    scatter, which outliers hardly change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +355,4 @@ def _turn(view: NeighbourView, tops_lefts: Index, times: int, shift: Array, prec
     spread = np.einsum("n,nki,nkj,n->ij", both, jacobian, jacobian, both)
     covariance = 2 * variance * inverse @ spread @ inverse
     middle_s, neighbour_s = view.middles_s()
-    own = max(float((left**2).mean()) - 2 * variance, 0.0)
-    return PairTurn(
-        middle_s, neighbour_s, rate, covariance, float(np.sqrt(2 * variance)), len(left), float(np.sqrt(own))
-    )
+    return PairTurn(middle_s, neighbour_s, rate, covariance, float(np.sqrt(2 * variance)), len(left))

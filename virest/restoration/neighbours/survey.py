@@ -62,19 +62,17 @@ def store_lumas(
 
 def survey_turns(
     runs: Sequence[Sequence[int]], sights: Mapping[int, Sight], neighbours: FrameNeighbours, trajectory: Trajectory
-) -> tuple[MissingTurn | None, float | None, float]:
+) -> tuple[MissingTurn | None, float | None]:
     """The rotation that the prediction lacks, from runs of frames; None: not significant, or not measurable.
 
-    And the standard deviation, rad/s, of the rate that it may lack without that; None: not measurable.  And the speed,
-    px/s, of what moves on its own: the median over the pairs.
+    And the standard deviation, rad/s, of the rate that it may lack without that; None: not measurable.
     """
     motions: list[RowMotion] = [s.motion for s in sights.values() if s.usable and s.motion is not None]
     turns = [
         [neighbours.turn(sights[a], sights[b]) if a in sights and b in sights else None for a, b in pairwise(run)]
         for run in runs
     ]
-    own_px_s = [turn.own_px_s for run in turns for turn in run if turn is not None]
-    return missing_turn(turns, motions, trajectory), undetected_rad_s(turns), float(np.median(own_px_s or [0.0]))
+    return missing_turn(turns, motions, trajectory), undetected_rad_s(turns)
 
 
 def survey_gain(
