@@ -33,8 +33,9 @@ KNOTS = 5
 """Most knots of a curve over a logged quantity: a cubic spline through 5 follows one period to 10 % (rms)."""
 FRAMES_OFF = (1, -1, 2, -2)
 """Rows by which a recorder's table of exposures may lag (+) or lead (−) the movie."""
-ONE = 0.1
-"""A gain follows another frame's exposure × ISO if its factor is 1 within this, or within two standard deviations."""
+FROM_ONE = 0.25
+"""Largest difference from 1 of the factor by which gains follow another frame's exposure × ISO: half way to the factor
+of an encoder that is late by half a frame (DELAY_FRAMES)."""
 FOLLOWED = ("gain_drift", "response_curve", "black_level")
 """Causes that brightness shows where exposure × ISO varies."""
 NEXT = {
@@ -113,7 +114,7 @@ def _followed(
         fit = fit_photometry(seen, without, [effect])
         if fit.rms**2 > most_left:
             continue
-        if form.frames_off and abs(float(fit.values[0]) - 1) > max(ONE, 2 * float(fit.std[0])):
+        if form.frames_off and abs(float(fit.values[0]) - 1) > FROM_ONE:
             continue
         held = judge(seen, without, [effect], each, by_side=True)
         if held.after**2 > most_left:

@@ -108,7 +108,9 @@ class NeighbourRegistration:
     std_px: Array
     """(n,) standard deviation of the registration in those tiles, per axis."""
     own_shift_px: Array
-    """(n, 2) each tile's own shift; NaN where the neighbour shows something else."""
+    """(n, 2) each tile's own shift."""
+    precision: Array
+    """(n,) relative precision of these; 0: the neighbour shows something else."""
     apart_s: Array
     """(n,) time from the frame's to the neighbour's observation of those tiles."""
     coding_noise_ratio: float = 1.0
@@ -172,7 +174,7 @@ def register_neighbour(
     seen = (agreement.inside & ~agreement.clipped)[:height, :width]
     return NeighbourRegistration(
         number, view, shift, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px,
-        np.where(used[:, None], agreement.shift_px, np.nan), view.apart_s(agreement.centres_px),
+        agreement.shift_px, agreement.precision, view.apart_s(agreement.centres_px),
     )  # fmt: skip
 
 
