@@ -18,12 +18,19 @@ from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import focus_log
 from virest.diagnosis.ambiguities import merged
-from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, Bridges, blur_std_px, doubtful_pairs, with_bridges
+from virest.diagnosis.field.bridging import (
+    LEAST_PAIRS_LEFT,
+    Bridges,
+    blur_std_px,
+    doubtful_pairs,
+    pair_medians,
+)
+from virest.diagnosis.field.contradicted import climb_with_bridges, contradicted_stretches
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.form_list import forms_of_pairs
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import is_believable, with_fields
-from virest.diagnosis.field.stretches import bridging_form, rate_walk
+from virest.diagnosis.field.stretches import KNOT_STEP_S, bridging_form, rate_walk
 from virest.diagnosis.field.sudden import best_instant, sudden_change
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
@@ -75,14 +82,12 @@ def judged(
     phone: StrangePhone, nominal: CameraProfile, rungs: int = 0, fitted: tuple[Term, ...] = ()
 ) -> tuple[GeometricVerdict, list[FieldFinding]]:
     """Fields after a ladder of some rungs, as in a diagnosis; ``fitted`` lists terms included from the start."""
-    capture, observed = phone.capture, phone.observed
-    doubtful = doubtful_pairs(observed, capture, nominal)
-    evidence = make_evidence(capture.imu, doubtful.for_ladder(observed), nominal)
-    bridges = Bridges.over(doubtful, observed, capture, nominal) if doubtful.stretches else None
-    found = climb(evidence, nominal, fitted, (), max_rungs=rungs, bridged=bridges and bridges.refitted)
-    found.evidence = evidence
-    if bridges is not None:
-        with_bridges(found, bridges, capture)
+    capture = phone.capture
+
+    def climbing(evidence: Evidence, bridged: Callable[[Model], Model] | None) -> GeometricVerdict:
+        return climb(evidence, nominal, fitted, (), max_rungs=rungs, bridged=bridged)
+
+    found = climb_with_bridges(phone.observed, capture, nominal, climbing)
     found = with_fields(found, found.evidence, capture)
     return found, [finding_of(entry, found.noise_px) for entry in found.fields]
 
@@ -329,6 +334,40 @@ def test_an_interpolated_gap_is_bridged_from_the_points() -> None:
     assert verdict.final_rms_px < 1.3 * HAND.noise_px
     # with the bridge in the profile, the interval is no longer doubtful
     assert not doubtful_pairs(phone.observed, phone.capture, verdict.model.profile).stretches
+
+
+def test_an_interval_that_only_the_points_contradict_is_bridged(rng: np.random.Generator) -> None:
+    """Noise on the filled readings hides the straight line; neither the ladder nor another field takes the interval."""
+
+    def log(time_s, reading, force):
+        return filled(1.0, 1.15)(time_s, reading, force) + rng.normal(0, 0.004, reading.shape)
+
+    phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=log))
+    assert not doubtful_stretches(phone.imu)
+    verdict, (field,) = judged(phone, phone.profile, rungs=1)
+    assert not verdict.accepted
+    assert field.shape == "contradicted"
+    ((from_s, to_s),) = verdict.model.profile.imu_untrusted_s
+    assert (from_s, to_s) == pytest.approx((1.0, 1.15), abs=2 * KNOT_STEP_S)
+    assert field.p_value < 1e-6
+    assert gained(field) > 0.95
+    assert "the log does not follow the frames" in field.sentence
+    assert verdict.final_rms_px < 1.3 * HAND.noise_px
+
+
+def test_a_badly_tracked_pair_is_no_interval_of_the_log(rng: np.random.Generator) -> None:
+    """Errors that differ from point to point need no other rate, however large."""
+    phone = StrangePhone(replace(HAND, seed=77), Strange())
+    pairs = list(phone.observed.pairs)
+    for k in (20, 21):
+        moved = pairs[k].points_second_px + rng.normal(0, 1.0, pairs[k].points_second_px.shape)
+        pairs[k] = replace(pairs[k], points_second_px=moved)
+    evidence = make_evidence(phone.imu, replace(phone.observed, pairs=tuple(pairs)))
+    found = climb(evidence, phone.profile, (), (), max_rungs=0)
+    found.evidence = evidence
+    medians = pair_medians(found.fit.distance, found.table, len(pairs))
+    assert medians[20:22].min() > 5 * np.median(medians)
+    assert not contradicted_stretches(found, phone.capture, phone.profile)
 
 
 def test_a_clipping_gyroscope_is_found_with_its_limit() -> None:

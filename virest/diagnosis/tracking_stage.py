@@ -12,10 +12,11 @@ from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.candidates import FarStart
-from virest.diagnosis.field.bridging import Bridges, doubtful_pairs, with_bridges
+from virest.diagnosis.field.bridging import doubtful_pairs
+from virest.diagnosis.field.contradicted import climb_with_bridges
 from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
-from virest.diagnosis.geometric_evidence import make_evidence
+from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.picture_ladder import Reader
@@ -107,18 +108,19 @@ class TrackedPoints:
         return with_fields(replace(found, model=model), found.evidence, self.capture)
 
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
-        doubtful = doubtful_pairs(observed, self.capture, self.start)
-        evidence = make_evidence(self.capture.imu, doubtful.for_ladder(observed), self.start)
-        bridges = None
-        if self.rungs_allowed and doubtful.stretches:
-            bridges = Bridges.over(doubtful, observed, self.capture, self.start)
-        found = climb(
-            evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed, self.each,
-            None if bridges is None else bridges.refitted,
-        )  # fmt: skip
+        def climbing(evidence: Evidence, bridged: Callable[[Model], Model] | None) -> GeometricVerdict:
+            return climb(
+                evidence, self.start, self.null_terms, self.schedules, self.far, progress, self.rungs_allowed,
+                self.each, bridged,
+            )  # fmt: skip
+
+        if self.rungs_allowed:
+            return climb_with_bridges(observed, self.capture, self.start, climbing)
+        evidence = make_evidence(
+            self.capture.imu, doubtful_pairs(observed, self.capture, self.start).for_ladder(observed), self.start
+        )
+        found = climbing(evidence, None)
         found.evidence = evidence
-        if bridges is not None:
-            with_bridges(found, bridges, self.capture)
         return found
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from virest.arrays import Mask
 from virest.capture.imu import ImuSamples
 
-STRAIGHT, CLIPPED = "straight", "clipped"
+STRAIGHT, CLIPPED, CONTRADICTED = "straight", "clipped", "contradicted"
 STRAIGHT_PART = 0.03
 """Second differences below this fraction of their median count as those of a straight line."""
 CHANCE = 1e-6
@@ -33,13 +33,15 @@ class Stretch:
     """An untrusted part of the log."""
 
     kind: str
-    """``straight`` or ``clipped``."""
+    """``straight`` or ``clipped``; ``contradicted``: only the points show it, not the log."""
     from_s: float
     """IMU clock from stamp_0; the last trusted reading before it."""
     to_s: float
     axes: tuple[int, ...]
     limit_rad_s: float | None = None
     """Largest reading of a clipped axis."""
+    p_value: float | None = None
+    """Probability per capture that points contradict an interval like this by chance; None: the log shows it."""
 
 
 def doubtful_stretches(imu: ImuSamples) -> list[Stretch]:

@@ -66,13 +66,18 @@ class ObservedTracks:
         kept = tuple(pair for pair, u in zip(self.pairs, use, strict=True) if u)
         return replace(self, pairs=kept, noise_px=self.noise_px[use])
 
-    def covered(self, imu: ImuSamples, profile: CameraProfile) -> ObservedTracks:
-        """The pairs whose frames lie inside the inertial data, without a gap or untrusted stretch between them."""
+    def spans_s(self, profile: CameraProfile) -> tuple[Array, Array]:
+        """Begin of the first frame's exposure and end of the second's, IMU clock, (pairs,) each."""
         shutter = profile.shutter
         start = np.asarray(RowClock(profile).time_s(self.stamp_s, self.exposure_s))
-        last = abs(shutter.readout_time_s) + shutter.true_exposure_s(self.exposure_s) + MARGIN_S
-        begin = np.array([start[pair.first] - MARGIN_S for pair in self.pairs])
-        end = np.array([start[pair.second] + last[pair.second] for pair in self.pairs])
+        last = abs(shutter.readout_time_s) + shutter.true_exposure_s(self.exposure_s)
+        begin = np.array([start[pair.first] for pair in self.pairs])
+        return begin, np.array([start[pair.second] + last[pair.second] for pair in self.pairs])
+
+    def covered(self, imu: ImuSamples, profile: CameraProfile) -> ObservedTracks:
+        """The pairs whose frames lie inside the inertial data, without a gap or untrusted stretch between them."""
+        begin, end = self.spans_s(profile)
+        begin, end = begin - MARGIN_S, end + MARGIN_S
         use = (begin > imu.time_s[0]) & (end < imu.time_s[-1])
         steps = np.diff(imu.time_s)
         for gap in np.flatnonzero(steps > max(MARGIN_S, IMU_PAUSE_PERIODS * float(np.median(steps)))):

@@ -25,7 +25,7 @@ from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
 from virest.image_formation.point_model import TrackTable, integrate_motion, seen_s
 from virest.inference.chance import chance_of_larger
 from virest.inference.comparable_noise import noise_distances
-from virest.inference.doubtful_log import Stretch, doubtful_stretches
+from virest.inference.doubtful_log import CONTRADICTED, Stretch, doubtful_stretches
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.track_fit import Term, TrackFit, for_table, start_scene
 from virest.motion.scene_motion import InertialMotion
@@ -53,13 +53,17 @@ class Doubtful:
         """The unaffected pairs for the ladder; all pairs if fewer than LEAST_PAIRS_LEFT are unaffected."""
         return observed.chosen(~self.hit) if (~self.hit).sum() >= LEAST_PAIRS_LEFT else observed
 
+    @staticmethod
+    def over(stretches: Sequence[Stretch], observed: ObservedTracks, profile: CameraProfile) -> Doubtful:
+        """Some intervals with the pairs that overlap them, by a profile's clocks."""
+        return Doubtful(tuple(stretches), touching(observed, stretches, _to_imu(profile)))
+
 
 def doubtful_pairs(observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> Doubtful:
     """Find the pairs that overlap log intervals that do not look like gyroscope data and that no field bridges."""
-    to_imu = _to_imu(profile)
     found = (s for s in doubtful_stretches(capture.imu) if not profile.bridges(s.from_s, s.to_s))
-    seen = [stretch for stretch in found if touching(observed, [stretch], to_imu).any()]
-    return Doubtful(tuple(seen), touching(observed, seen, to_imu))
+    seen = [stretch for stretch in found if touching(observed, [stretch], _to_imu(profile)).any()]
+    return Doubtful.over(seen, observed, profile)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,16 +95,50 @@ class Bridges:
         table = self.evidence.table(model, JUDGE_POINTS)
         return replace(model, profile=self.fitted(_with_scene(self.evidence, model, table), table).profile)
 
+    def held_out(self, found: GeometricVerdict) -> HeldOutBridges:
+        """Residuals with the bridges beside a verdict's model, on points that the bridges were not fitted to."""
+        evidence, observed = self.evidence, self.evidence.observed
+        table, spread = evidence.table(found.model, FINAL_POINTS), found.fit.depth_spread_per_m
+        bare = self.without(_with_scene(evidence, replace(found.model, terms=()), table))
+        before = evidence.distances(evidence.fit(bare, (), table), table, spread)
+        half: Mask = np.asarray(np.arange(len(table)) % 2 == 0)
+        after = np.zeros(len(table))
+        for part in (half, ~half):
+            fitted = self.fitted(bare, table.chosen(part))
+            after[~part] = evidence.distances(fitted, table, spread)[~part]
+        noise = noise_distances(observed, fitted)
+        near = [touching(observed, [stretch], _to_imu(bare.profile)) for stretch in self.doubtful.stretches]
+        return HeldOutBridges(self, bare, table, before, after, noise, np.array(near))
+
+    def trimmed(self, model: Model, least_chi2: float) -> list[Stretch]:
+        """The intervals, each from the last knot before those whose rates differ from 0 to the first after them.
+
+        least_chi2: of a knot's rates on the three axes, in their standard deviations.  Without such a knot an interval
+        is dropped.
+        """
+        table = self.evidence.table(model, FINAL_POINTS)
+        bare = self.without(_with_scene(self.evidence, replace(model, terms=()), table))
+        fitted = fit_model(self.evidence.imu, bare, (self.form.term,), table)
+        part = fitted.slices[self.form.name]
+        found = []
+        for stretch, field in zip(
+            self.doubtful.stretches, self.form.filled(fitted.change[part], fitted.covariance[part, part]), strict=True
+        ):
+            rate, std = np.array(field.values)[1:-1], np.array(field.std)[1:-1]
+            differing = 1 + np.flatnonzero(((rate / np.maximum(std, 1e-12)) ** 2).sum(axis=-1) > least_chi2)
+            if len(differing):
+                first, last = field.knots[0][differing[0] - 1], field.knots[0][differing[-1] + 1]
+                found.append(replace(stretch, from_s=first, to_s=last))
+        return found
+
 
 def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) -> None:
     """Test the pairs in the intervals, and add to the verdict what their points show about the intervals."""
-    evidence, stretches, hit = bridges.evidence, bridges.doubtful.stretches, bridges.doubtful.hit
-    table, terms, typical = evidence.table(found.model, FINAL_POINTS), found.model.terms, evidence.typical_px
-    bare = bridges.without(_with_scene(evidence, replace(found.model, terms=()), table))
-    spread = found.fit.depth_spread_per_m
-    before = evidence.distances(evidence.fit(bare, (), table), table, spread)
-    p_value = None if hit.all() else _larger_residual_p(before, table, hit)
-    if p_value is not None and p_value > MAX_P:
+    evidence, stretches = bridges.evidence, bridges.doubtful.stretches
+    terms, tested = found.model.terms, bridges.held_out(found)
+    bare = tested.bare
+    confirmed = {kind: tested.p_value(kind) for kind in dict.fromkeys(stretch.kind for stretch in stretches)}
+    if all(p_value is not None and p_value > MAX_P for p_value in confirmed.values()):
         found.notes.append(
             f"{len(stretches)} stretches of the inertial log look {stretches[0].kind}; "
             "tracked points do not confirm it, and their frames were excluded from the fits"
@@ -108,35 +146,78 @@ def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) ->
         rest = make_evidence(evidence.imu, bridges.doubtful.for_ladder(evidence.observed), bare.profile)
         _refit(found, rest, bridges.without(found.model), terms)
         return
-    half, after = np.arange(len(table)) % 2 == 0, np.zeros(len(table))
-    for part in (half, ~half):
-        fitted = bridges.fitted(bare, table.chosen(part))
-        after[~part] = evidence.distances(fitted, table, spread)[~part]
-    noise = noise_distances(evidence.observed, fitted)
-    pair = np.repeat(np.arange(len(hit)), [len(pair) for pair in evidence.observed.pairs])
-
-    def rms_px(pairs: Mask) -> Array:
-        """Rms (3,) without bridges, with bridges on held-out points, and of tracking noise."""
-        inside = pairs[table.pair]
-        return typical * np.array([capped_rms(d) for d in (before[inside], after[inside], noise[pairs[pair]])])
-
-    near = np.array([touching(evidence.observed, [stretch], _to_imu(bare.profile)) for stretch in stretches])
-    holds = np.array([_holds(*rms_px(pairs)) for pairs in near])
-    trusted = ~near[~holds].any(axis=0)
+    trusted: Mask = np.asarray(~tested.near[~tested.holds].any(axis=0))
     kept = evidence.observed.chosen(trusted) if trusted.sum() >= LEAST_PAIRS_LEFT else evidence.observed
     _refit(found, make_evidence(evidence.imu, kept, bare.profile), bare, (*terms, bridges.form.term))
     profile, form = found.model.profile, bridges.form
     part_of = found.fit.slices[form.name]
     covariance = found.fit.covariance[part_of, part_of]
     std = form.filled(np.zeros(len(covariance)), covariance)
-    fields = (replace(form.held_in(profile, own), std=own.std) for own in std)
-    accurate = blur_std_px(found.fit, found.table, form, covariance) < MAX_BLUR_STD_PX
+    fields = [replace(form.held_in(profile, own), std=own.std) for own in std]
+    usable = tested.holds & (blur_std_px(found.fit, found.table, form, covariance) < MAX_BLUR_STD_PX)
     untrusted = tuple((s.from_s, s.to_s) for s in stretches)
     profile = replace(profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
     found.model = replace(found.model, profile=profile)
-    found.fields.append(
-        Distrusted(stretches, tuple(fields), tuple((holds & accurate).tolist()), p_value, *map(float, rms_px(hit)))
-    )
+    for kind, p_value in confirmed.items():
+        of_kind = [k for k, stretch in enumerate(stretches) if stretch.kind == kind]
+        found.fields.append(
+            Distrusted(
+                tuple(stretches[k] for k in of_kind),
+                tuple(fields[k] for k in of_kind),
+                tuple(bool(usable[k]) for k in of_kind),
+                p_value,
+                *map(float, tested.rms_px(np.asarray(tested.near[of_kind].any(axis=0)))),
+            )
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutBridges:
+    """Residuals of the points of all pairs without bridges, and with bridges fitted to the other half of the points."""
+
+    bridges: Bridges
+    bare: Model
+    """The model without bridges or terms."""
+    table: TrackTable
+    before: Array
+    """(n,) whitened distances without bridges."""
+    after: Array
+    """(n,) with bridges that these points took no part in."""
+    noise: Array
+    """(points,) of all tracked points, from a smooth flow."""
+    near: Mask
+    """(intervals, pairs): which pairs overlap an interval."""
+
+    def rms_px(self, pairs: Mask) -> Array:
+        """Rms (3,) over some pairs' points without bridges, with bridges, and of tracking noise."""
+        observed = self.bridges.evidence.observed
+        pair = np.repeat(np.arange(len(pairs)), [len(pair) for pair in observed.pairs])
+        inside = pairs[self.table.pair]
+        parts = self.before[inside], self.after[inside], self.noise[pairs[pair]]
+        return self.bridges.evidence.typical_px * np.array([capped_rms(part) for part in parts])
+
+    @property
+    def holds(self) -> Mask:
+        """Whether a bridge explains the points of its pairs, (intervals,)."""
+        return np.array([_holds(*self.rms_px(pairs)) for pairs in self.near])
+
+    @property
+    def convicted(self) -> Mask:
+        """Whether points (intervals,) differ from a smooth flow without bridges, and bridges remove this difference."""
+        return np.array([_convicted(*self.rms_px(pairs)) for pairs in self.near])
+
+    def p_value(self, kind: str) -> float | None:
+        """Of residuals near the intervals of a kind being no larger than elsewhere; None if no pair lies elsewhere."""
+        stretches = self.bridges.doubtful.stretches
+        if kind == CONTRADICTED:
+            return min(stretch.p_value for stretch in stretches if stretch.p_value is not None)
+        if self.bridges.doubtful.hit.all():
+            return None
+        return _larger_residual_p(
+            pair_medians(self.before, self.table, self.near.shape[1]),
+            np.asarray(self.near[[stretch.kind == kind for stretch in stretches]].any(axis=0)),
+            self.bridges.doubtful.hit,
+        )
 
 
 def _to_imu(profile: CameraProfile) -> tuple[float, float]:
@@ -186,16 +267,31 @@ def blur_std_px(fitted: TrackFit, table: TrackTable, form: FieldForm, covariance
 
 
 def _holds(before: float, after: float, noise: float) -> bool:
-    """Whether bridging removes most of the excess residual of the points in an interval."""
-    return after < MAX_RMS_RATIO * noise or after**2 - noise**2 < MAX_EXCESS_LEFT * (before**2 - noise**2)
+    """Whether bridging leaves the points in an interval their noise, or removes most of their excess residual."""
+    return after < MAX_RMS_RATIO * noise or _removes_excess(before, after, noise)
 
 
-def _larger_residual_p(distance: Array, table: TrackTable, hit: Mask) -> float:
-    """p value of the affected pairs' residuals being no larger than the others': t test on log medians per pair.
+def _convicted(before: float, after: float, noise: float) -> bool:
+    """Whether the points in an interval contradict the log: badly tracked pairs have noise, but no excess."""
+    return before > MAX_RMS_RATIO * noise and _removes_excess(before, after, noise)
+
+
+def _removes_excess(before: float, after: float, noise: float) -> bool:
+    return after**2 - noise**2 < MAX_EXCESS_LEFT * (before**2 - noise**2)
+
+
+def pair_medians(distance: Array, table: TrackTable, pairs: int) -> Array:
+    """Median (pairs,) of the points' distances in each pair; nan without points."""
+    medians = np.full(pairs, np.nan)
+    for number in np.unique(table.pair):
+        medians[number] = np.median(distance[table.pair == number])
+    return medians
+
+
+def _larger_residual_p(medians: Array, inside: Mask, hit: Mask) -> float:
+    """p value of the residuals inside being no larger than those of pairs not hit: t test on log medians per pair.
 
     A rank test would ignore how far a few outlying pairs deviate.
     """
-    numbers = np.unique(table.pair)
-    medians = np.array([np.median(distance[table.pair == number]) for number in numbers])
-    inside, size = hit[numbers], np.log(np.maximum(medians, np.finfo(float).tiny))
-    return chance_of_larger(size[inside], size[~inside])
+    size, known = np.log(np.maximum(medians, np.finfo(float).tiny)), np.isfinite(medians)
+    return chance_of_larger(size[inside & known], size[~hit & known])

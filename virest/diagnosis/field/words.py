@@ -15,7 +15,7 @@ from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S
 from virest.diagnosis.field.records import Distrusted, FittedField
 from virest.diagnosis.field.stretches import axis_names
 from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
-from virest.inference.doubtful_log import CLIPPED
+from virest.inference.doubtful_log import CLIPPED, STRAIGHT
 
 MIN_EXPLAINED = 0.95
 """Part of a field's variance that a shape must explain to name it."""
@@ -176,9 +176,17 @@ def _distrusted(entry: Distrusted) -> FieldFinding:
             if several
             else f"for {total_s * 1e3:.0f} ms from {first.from_s:.2f} s"
         )
-        sentence = f"{where} the log does not follow the frames: inertial rows there lie on a straight line"
-        reasons = "rows were lost and a program interpolated the gap, or the sensor's queue stalled"
-        following = "look at the raw log for rows with equal steps, and record with less load on the phone"
+        sentence = f"{where} the log does not follow the frames"
+        if first.kind == STRAIGHT:
+            sentence += ": inertial rows there lie on a straight line"
+            reasons = "rows were lost and a program interpolated the gap, or the sensor's queue stalled"
+            following = "look at the raw log for rows with equal steps, and record with less load on the phone"
+        else:
+            reasons = (
+                "rows were lost and a program filled the gap, the sensor was knocked or left its range, "
+                "or these frames were stored under wrong timestamps"
+            )
+            following = "compare the log's raw rows there with those around it, and record the motion again"
     usable = sum(entry.usable)
     bridged = "bridged from the points" if all(entry.usable) else "not corrected by process"
     if 0 < usable < len(entry.usable):

@@ -1,0 +1,107 @@
+"""Intervals of the inertial log that only the points contradict, and the climb beside bridges over doubtful intervals.
+
+A log can be wrong for a moment without a trace in itself: a program fills a gap with a smooth curve, a sensor clips
+before its filter, a case is knocked.  The pairs of frames that see such an interval then have far larger residuals than
+all others, and a rate that is free inside it removes them from points that took no part in its estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from virest.arrays import Array
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Capture
+from virest.diagnosis.field.bridging import (
+    LEAST_PAIRS_LEFT,
+    Bridges,
+    Doubtful,
+    doubtful_pairs,
+    pair_medians,
+    with_bridges,
+)
+from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
+from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.inference.chance import chi2_below, normal_deviate, normal_tail
+from virest.inference.doubtful_log import CONTRADICTED, Stretch
+from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.robust import robust_std
+
+MAX_P = 1e-3
+"""False-alarm probability, per capture, of a pair that stands out; also that of a knot of a trial bridge."""
+
+Climb = Callable[[Evidence, Callable[[Model], Model] | None], GeometricVerdict]
+
+
+def climb_with_bridges(
+    observed: ObservedTracks, capture: Capture, start: CameraProfile, climb: Climb
+) -> GeometricVerdict:
+    """Climb without the pairs in doubtful intervals of the log, and bridge the intervals from their points.
+
+    climb: the ladder, from evidence and the estimate of the bridges beside a model (None: there are none).  If the
+    points contradict the log in further intervals, the ladder is climbed again without these.
+    """
+    doubtful = doubtful_pairs(observed, capture, start)
+    found = _climbed(observed, capture, start, climb, doubtful)
+    further = contradicted_stretches(found, capture, start)
+    if not further:
+        return found
+    stretches = tuple(sorted((*doubtful.stretches, *further), key=lambda stretch: stretch.from_s))
+    return _climbed(observed, capture, start, climb, Doubtful.over(stretches, observed, start))
+
+
+def _climbed(
+    observed: ObservedTracks, capture: Capture, start: CameraProfile, climb: Climb, doubtful: Doubtful
+) -> GeometricVerdict:
+    evidence = make_evidence(capture.imu, doubtful.for_ladder(observed), start)
+    bridges = Bridges.over(doubtful, observed, capture, start) if doubtful.stretches else None
+    found = climb(evidence, None if bridges is None else bridges.refitted)
+    found.evidence = evidence
+    if bridges is not None:
+        with_bridges(found, bridges, capture)
+    return found
+
+
+def contradicted_stretches(found: GeometricVerdict, capture: Capture, start: CameraProfile) -> list[Stretch]:
+    """Intervals whose pairs stand out after a ladder, and where a free rate explains points that it was not fitted to.
+
+    Each reaches from the last knot of a trial bridge that agrees with the log to the next that does.
+    """
+    evidence, model = found.evidence, found.model
+    assert evidence is not None
+    observed = evidence.observed
+    distance = evidence.distances(found.fit, found.table, found.fit.depth_spread_per_m)
+    spans = _spans(observed, model, pair_medians(distance, found.table, len(observed.pairs)))
+    whole = Bridges.over(Doubtful.over(spans, observed, start), observed, capture, start)
+    if not spans or (~whole.doubtful.hit).sum() < LEAST_PAIRS_LEFT:
+        return []
+    trimmed = whole.trimmed(model, chi2_below(1 - MAX_P, 3))
+    if not trimmed:
+        return []
+    bridges = Bridges.over(Doubtful.over(trimmed, observed, start), observed, capture, start)
+    convicted = bridges.held_out(found).convicted
+    return [stretch for stretch, wrong in zip(trimmed, convicted, strict=True) if wrong]
+
+
+def _spans(observed: ObservedTracks, model: Model, medians: Array) -> list[Stretch]:
+    """Intervals, IMU clock, seen by runs of pairs whose median residuals (pairs,) are outliers among all pairs'.
+
+    The logarithm of a pair's median is taken for normally distributed.
+    """
+    level = np.log(np.maximum(medians, np.finfo(float).tiny))
+    level -= np.nanmedian(level)
+    deviation = level / max(robust_std(level[np.isfinite(level)]), np.finfo(float).tiny)
+    stamp_s = observed.stamp_s + (np.array(model.lag) if model.lag else 0.0)
+    begin_s, end_s = replace(observed, stamp_s=stamp_s).spans_s(model.profile)
+    spans: list[Stretch] = []
+    for pair in np.flatnonzero(deviation > normal_deviate(MAX_P / max(len(medians), 1))):
+        p_value = min(len(medians) * normal_tail(deviation[pair]), 1.0)
+        from_s, to_s = float(begin_s[pair]), float(end_s[pair])
+        if spans and from_s <= spans[-1].to_s:
+            last = spans.pop()
+            from_s, p_value = last.from_s, min(p_value, last.p_value or 1.0)
+        spans.append(Stretch(CONTRADICTED, from_s, to_s, (0, 1, 2), p_value=p_value))
+    return spans
