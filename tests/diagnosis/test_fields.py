@@ -381,6 +381,22 @@ def test_a_clipping_gyroscope_is_found_with_its_limit() -> None:
     assert field.held_out.after < field.held_out.before
 
 
+def test_a_sensor_that_clips_before_its_noise_is_found_by_the_points(rng: np.random.Generator) -> None:
+    """Noise on the clipped readings hides the limit in the log; the intervals have their largest readings in common."""
+
+    def log(time_s, reading, force):
+        return np.clip(reading, -1.6, 1.6) + rng.normal(0, 0.004, reading.shape)
+
+    phone = StrangePhone(replace(HAND, seed=78), Strange(gyro=log))
+    assert not doubtful_stretches(phone.imu)
+    _, (field,) = judged(phone, phone.profile)
+    assert field.shape == "contradicted"
+    assert len(field.stretches_s) >= 3
+    assert "the rate reaches its largest reading, from 1.6" in field.sentence
+    assert "clips" in field.reasons
+    assert field.held_out.after < 0.5 * field.held_out.before
+
+
 class WholeRowsLost(StrangePhone):
     """The accelerometer's readings are lost and interpolated too."""
 

@@ -17,7 +17,8 @@ from virest.inference.fit_start import FitStart
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.parallel import ParallelMap
 from virest.inference.time_blocks import halves
-from virest.inference.track_fit import Term, fit_from
+from virest.inference.track_fit import Term, fit_from, for_table, unfitted
+from virest.motion.scene_motion import PLANE_STD_PER_M, InertialMotion, Motion
 
 JUDGE_POINTS = 3500
 """Points used to judge a cause; half of them fit it."""
@@ -27,6 +28,10 @@ LAGGING_BLOCK = 2
 FIRST_ITERATIONS, SURVIVORS, SURVIVING_STARTS = 2, 3, 2
 """Iterations of all candidates in the first round; causes that continue, as a multiple of the count wanted; and
 starting points kept per cause."""
+
+SCENE_ROUNDS, NEAR_LOSS, LEAST_GAIN = 3, 1.5, 0.01
+"""Rounds in which judged causes are fitted from the best one's scene; they end when none gains LEAST_GAIN of its loss.
+A cause is not fitted if its loss with that scene is more than NEAR_LOSS times its own."""
 
 FOLDS = (0, 1)
 """A fit of fold k uses every other time block, from block k on; the others judge it."""
@@ -162,18 +167,33 @@ def promising(base: Screened, better: Sequence[Screened], count: int) -> tuple[f
 def judge(
     evidence: Evidence, screened: Sequence[Screened], scale: float, depth_spread_per_m: float, each: ParallelMap
 ) -> list[Judged]:
-    """Fit on every other block, judge on the rest, and vice versa."""
+    """Fit on every other block, judge on the rest, and vice versa.
+
+    Where the camera hardly travels, the scene's values trade against each other, and how far a fit follows them depends
+    on its start.  Each cause is therefore also fitted from the scene of the best fit.
+    """
     tables = [evidence.table(entry.candidate.model, JUDGE_POINTS) for entry in screened]
     use = halves(evidence.block)
     calls = [
-        (evidence.imu, table, model, (*model.terms, *entry.candidate.added), use[fold], depth_spread_per_m)
+        (evidence.imu, table, model, (*model.terms, *entry.candidate.added), use[fold], depth_spread_per_m, scale)
         for entry, table in zip(screened, tables, strict=True)
         for fold, model in enumerate(entry.models)
     ]  # fmt: skip
     found = each(_held_out, calls)
+    for _ in range(SCENE_ROUNDS):
+        again = []
+        for k, (call, own) in enumerate(zip(calls, found, strict=True)):
+            best = min((f for f in found[k % 2 :: 2] if f.model.lag == own.model.lag), key=lambda f: f.loss)
+            if best is not own and _is_free(own.model.scene) and _is_free(best.model.scene):
+                again.append((k, (*call[:2], replace(own.model, scene=best.model.scene), *call[3:], own)))
+        before = [own.loss for own in found]
+        for (k, _), better in zip(again, each(_held_out_if_better, [call for _, call in again]), strict=True):
+            found[k] = better
+        if all(now.loss > (1 - LEAST_GAIN) * own for now, own in zip(found, before, strict=True)):
+            break
     judged = []
     for entry, table, first, second in zip(screened, tables, found[::2], found[1::2], strict=True):
-        distance = np.where(use[0][table.pair], second, first)
+        distance = np.where(use[0][table.pair], second.distance, first.distance)
         judged.append(_judged(evidence, entry.candidate, table, distance, scale))
     return judged
 
@@ -210,12 +230,45 @@ def choose(
     return _judged(evidence, best.candidate, table, distance, scale)
 
 
+@dataclass(frozen=True, slots=True)
+class _HeldOut:
+    """A fit to the blocks of one fold."""
+
+    model: Model
+    distance: Array
+    """(n,) of all points."""
+    loss: float
+    """On the points that it was fitted to."""
+
+
 def _held_out(
-    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, depth_spread_per_m: float
-) -> Array:
-    """Distances (n,) of all points from a fit on the pairs in ``use`` (pairs,)."""
-    fitted = fit_model(imu, model, terms, table.chosen(use[table.pair]), covariances=False)
-    return distances(imu, fitted, table, depth_spread_per_m)
+    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, depth_spread_per_m: float,
+    scale: float,
+) -> _HeldOut:  # fmt: skip
+    """Fit the pairs in ``use`` (pairs,)."""
+    used = use[table.pair]
+    fitted = fit_model(imu, model, terms, table.chosen(used), covariances=False)
+    distance = distances(imu, fitted, table, depth_spread_per_m)
+    found = replace(model, profile=fitted.profile, scene=fitted.scene)
+    return _HeldOut(found, distance, float(loss(distance[used], scale).mean()))
+
+
+def _is_free(scene: Motion | None) -> bool:
+    """Whether a scene's plane is unknown: a given depth must not follow another cause's."""
+    return isinstance(scene, InertialMotion) and min(scene.plane_std_per_m) >= PLANE_STD_PER_M
+
+
+def _held_out_if_better(
+    imu: ImuSamples, table: TrackTable, model: Model, terms: Sequence[Term], use: Mask, depth_spread_per_m: float,
+    scale: float, own: _HeldOut,
+) -> _HeldOut:  # fmt: skip
+    """Fit from a model; the own fit if its loss is lower."""
+    part = table.chosen(use[table.pair])
+    start = FitStart(imu, part, model.profile, for_table(model.scene, part))
+    if float(loss(unfitted(start, depth_spread_per_m), scale).mean()) > NEAR_LOSS * own.loss:
+        return own
+    again = _held_out(imu, table, model, terms, use, depth_spread_per_m, scale)
+    return min(own, again, key=lambda fit: fit.loss)
 
 
 def lagging_gain(evidence: Evidence, before: Judged, after: Judged) -> Array:

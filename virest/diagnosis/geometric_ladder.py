@@ -36,6 +36,7 @@ from virest.diagnosis.geometric_significance import fitted_with, is_plausible, p
 from virest.diagnosis.geometric_verdict import FINAL_POINTS, Accepted, GeometricVerdict
 from virest.diagnosis.left_open import variance_left_open
 from virest.diagnosis.selection import POINT_LEVELS
+from virest.diagnosis.structure import STRUCTURE_NOISES
 from virest.inference.chance import chance_of, t_ratio
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.recorder_lag import Schedule
@@ -63,6 +64,8 @@ SIMPLER = {"gyro_lowpass": "time_offset", "pixel_aspect": "focal_length", "gyro_
 """For slow rotations a low-pass filter is a delay; along one image direction a pixel aspect is a focal length; for
 rotations of one frequency averaging is a scale.  Where the points cannot distinguish the two, the simpler cause is
 reported, with the other as its rival."""
+MOST_GAIN = 0.9
+"""Fraction of the best cause's gain that a simpler one must reach to be reported in its place."""
 MAX_RUNGS = 5
 """Causes, or pairs of them, that may enter: a limit on time.  A rung with six of them to try takes 0.3 s."""
 
@@ -173,8 +176,8 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
     """The end that predicts held-out blocks better; of two equal ends, one with the other as its rival.
 
     Rounding may decide which end is reached first, but must not decide which is reported.  Of two equal ends, take the
-    one with fewer causes; then the one with fewer causes that have a simpler alternative (SIMPLER); then the one with
-    the lower held-out loss.  If the losses differ by less than EQUAL_T standard errors, rounding may change their
+    one with fewer causes; then the one with fewer causes that have a simpler alternative; then the one with the lower
+    held-out loss.  If the losses differ by less than EQUAL_T standard errors, rounding may change their
     order, so the names decide.  Two ends with the same causes differ only in where their fits stopped: take the first.
     """
     if {entry.name for entry in first.accepted} == {entry.name for entry in second.accepted}:
@@ -186,14 +189,15 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
     spread = max(first.fit.depth_spread_per_m, second.fit.depth_spread_per_m)
     one, other = judge(evidence, ends, min(first.fit.scale, second.fit.scale), spread, one_by_one)
     worse = t_ratio(other.block_loss - one.block_loss)
-    if abs(worse) >= RIVAL_T:
-        return first if worse > 0 else second
-    better = first if worse > 0 else second
+    better, lesser = (first, second) if worse > 0 else (second, first)
+    beyond = float(np.sqrt(abs(other.rms**2 - one.rms**2)))
+    if abs(worse) >= RIVAL_T and not (beyond < STRUCTURE_NOISES and _is_simplified(lesser, better)):
+        return better
     chosen, rival = sorted(
         (first, second),
         key=lambda end: (
             len(end.accepted),
-            sum(SIMPLER.get(entry.name) is not None for entry in end.accepted),
+            _less_simple({entry.name for entry in end.accepted}),
             abs(worse) >= EQUAL_T and end is not better,
             sorted(e.name for e in end.accepted),
         ),
@@ -212,6 +216,23 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
         )
     chosen.rival = rival
     return chosen
+
+
+def _is_simplified(end: GeometricVerdict, other: GeometricVerdict) -> bool:
+    """Whether an end has the simpler alternative of each cause of another."""
+    names, others = ({entry.name for entry in verdict.accepted} for verdict in (end, other))
+    return _less_simple(names) < _less_simple(others) and {SIMPLER.get(name, name) for name in others} == names
+
+
+def _less_simple(names: set[str]) -> int:
+    """Number of causes that have a simpler alternative.
+
+    A filter delays and averages: where the averaging is known, the delay is simpler as the filter's than as a clock's.
+    """
+    needless = set(SIMPLER)
+    if "gyro_averaging" in names:
+        needless = needless - {"gyro_lowpass"} | {"time_offset"}
+    return len(names & needless)
 
 
 def _joined(rivals: Sequence[Rival], more: Sequence[Rival]) -> tuple[Rival, ...]:
@@ -343,7 +364,11 @@ def _best_single(model: Model, trial: Trial) -> tuple[_Step | None, _Step | None
         entered, p_value = significant(evidence, best.candidate, model.profile, gain)
         if entered is None:
             continue
-        others = [other for other in judged if other is not best and _is_rival(before, best, other, gain)]
+        others = [
+            other
+            for other in judged
+            if other is not best and (_is_rival(before, best, other, gain) or _is_simpler(before, best, other, gain))
+        ]
         simpler = [other for other in others if other.candidate.name == SIMPLER.get(best.candidate.name)]
         if simpler:
             into, p_simpler = significant(evidence, simpler[0].candidate, model.profile, gain)
@@ -363,6 +388,16 @@ def _is_rival(before: Judged, best: Judged, other: Judged, gain: Array) -> bool:
     """Whether another cause gains more than half as much as the best, and the blocks do not clearly prefer the best."""
     apart = t_ratio(other.block_loss - best.block_loss)
     return apart < RIVAL_T and (before.block_loss - other.block_loss).mean() > 0.5 * gain.mean()
+
+
+def _is_simpler(before: Judged, best: Judged, other: Judged, gain: Array) -> bool:
+    """Whether a simpler cause gains nearly as much, and leaves no more beyond the best one than tracking errors do.
+
+    Blocks share these errors: their statistics alone would tell two causes apart by 0.03 px of a tracker's own bias.
+    """
+    beyond = np.sqrt(max(other.rms**2 - best.rms**2, 0.0))
+    nearly = (before.block_loss - other.block_loss).mean() > MOST_GAIN * gain.mean()
+    return other.candidate.name == SIMPLER.get(best.candidate.name) and beyond < STRUCTURE_NOISES and bool(nearly)
 
 
 def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: float) -> _Step | None:

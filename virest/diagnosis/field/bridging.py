@@ -203,8 +203,13 @@ class HeldOutBridges:
 
     @property
     def convicted(self) -> Mask:
-        """Whether points (intervals,) differ from a smooth flow without bridges, and bridges remove this difference."""
-        return np.array([_convicted(*self.rms_px(pairs)) for pairs in self.near])
+        """Whether points (intervals,) differ more than those of all other pairs, and bridges remove this difference.
+
+        A bridge does not move badly tracked points to where others of their pair are.
+        """
+        usual_px = self.rms_px(~self.bridges.doubtful.hit)[0]
+        found = (self.rms_px(pairs) for pairs in self.near)
+        return np.array([_convicted(before, after, usual_px) for before, after, _ in found])
 
     def p_value(self, kind: str) -> float | None:
         """Of residuals near the intervals of a kind being no larger than elsewhere; None if no pair lies elsewhere."""
@@ -271,9 +276,8 @@ def _holds(before: float, after: float, noise: float) -> bool:
     return after < MAX_RMS_RATIO * noise or _removes_excess(before, after, noise)
 
 
-def _convicted(before: float, after: float, noise: float) -> bool:
-    """Whether the points in an interval contradict the log: badly tracked pairs have noise, but no excess."""
-    return before > MAX_RMS_RATIO * noise and _removes_excess(before, after, noise)
+def _convicted(before: float, after: float, usual: float) -> bool:
+    return before > MAX_RMS_RATIO * usual and _removes_excess(before, after, usual)
 
 
 def _removes_excess(before: float, after: float, noise: float) -> bool:

@@ -181,6 +181,10 @@ def _distrusted(entry: Distrusted) -> FieldFinding:
             sentence += ": inertial rows there lie on a straight line"
             reasons = "rows were lost and a program interpolated the gap, or the sensor's queue stalled"
             following = "look at the raw log for rows with equal steps, and record with less load on the phone"
+        elif first.limit_rad_s is not None:
+            sentence += f"; in each, the rate reaches its largest reading, from {first.limit_rad_s:.3g} rad/s"
+            reasons = "the sensor clips: the rotation was faster than its range"
+            following = "set the sensor to a wider range, or move more slowly"
         else:
             reasons = (
                 "rows were lost and a program filled the gap, the sensor was knocked or left its range, "
