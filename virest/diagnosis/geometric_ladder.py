@@ -189,9 +189,8 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
     spread = max(first.fit.depth_spread_per_m, second.fit.depth_spread_per_m)
     one, other = judge(evidence, ends, min(first.fit.scale, second.fit.scale), spread, one_by_one)
     worse = t_ratio(other.block_loss - one.block_loss)
-    better, lesser = (first, second) if worse > 0 else (second, first)
-    beyond = float(np.sqrt(abs(other.rms**2 - one.rms**2)))
-    if abs(worse) >= RIVAL_T and not (beyond < STRUCTURE_NOISES and _is_simplified(lesser, better)):
+    better = first if worse > 0 else second
+    if abs(worse) >= RIVAL_T:
         return better
     chosen, rival = sorted(
         (first, second),
@@ -216,12 +215,6 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
         )
     chosen.rival = rival
     return chosen
-
-
-def _is_simplified(end: GeometricVerdict, other: GeometricVerdict) -> bool:
-    """Whether an end has the simpler alternative of each cause of another."""
-    names, others = ({entry.name for entry in verdict.accepted} for verdict in (end, other))
-    return _less_simple(names) < _less_simple(others) and {SIMPLER.get(name, name) for name in others} == names
 
 
 def _less_simple(names: set[str]) -> int:
