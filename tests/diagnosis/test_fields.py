@@ -21,9 +21,11 @@ from virest.diagnosis.ambiguities import merged
 from virest.diagnosis.field.bridging import (
     LEAST_PAIRS_LEFT,
     Bridges,
+    Doubtful,
     blur_std_px,
     doubtful_pairs,
     pair_medians,
+    with_bridges,
 )
 from virest.diagnosis.field.contradicted import climb_with_bridges, contradicted_stretches
 from virest.diagnosis.field.design import point_residuals
@@ -395,6 +397,24 @@ def test_a_sensor_that_clips_before_its_noise_is_found_by_the_points(rng: np.ran
     assert "the rate reaches its largest reading, from 1.6" in field.sentence
     assert "clips" in field.reasons
     assert field.held_out.after < 0.5 * field.held_out.before
+
+
+def test_an_interval_that_the_points_deny_is_dropped_beside_one_that_they_confirm() -> None:
+    """Each kind is tested by its own points: a confirmed gap confirms no limit that the rate only seems to reach."""
+    phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=filled(1.0, 1.15)))
+    verdict, _ = judged(phone, phone.profile)
+    (gap,) = doubtful_stretches(phone.imu)
+    sound = Stretch("clipped", 0.3, 0.34, (0,), 1.5)
+    bridges = Bridges.over(
+        Doubtful.over((sound, gap), phone.observed, phone.profile), phone.observed, phone.capture, phone.profile
+    )
+    verdict.fields.clear()
+    verdict.model = replace(verdict.model, profile=phone.profile)
+    with_bridges(verdict, bridges, phone.capture)
+    (entry,) = verdict.fields
+    assert [stretch.kind for stretch in entry.stretches] == ["straight"]
+    assert verdict.model.profile.imu_untrusted_s == ((gap.from_s, gap.to_s),)
+    assert any("look clipped; tracked points do not confirm it" in note for note in verdict.notes)
 
 
 class WholeRowsLost(StrangePhone):

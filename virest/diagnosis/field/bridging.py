@@ -138,13 +138,21 @@ def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) ->
     terms, tested = found.model.terms, bridges.held_out(found)
     bare = tested.bare
     confirmed = {kind: tested.p_value(kind) for kind in dict.fromkeys(stretch.kind for stretch in stretches)}
-    if all(p_value is not None and p_value > MAX_P for p_value in confirmed.values()):
-        found.notes.append(
-            f"{len(stretches)} stretches of the inertial log look {stretches[0].kind}; "
+    denied = [kind for kind, p_value in confirmed.items() if p_value is not None and p_value > MAX_P]
+    if denied:
+        others = [stretch for stretch in stretches if stretch.kind not in denied]
+        found.notes += [
+            f"{sum(stretch.kind == kind for stretch in stretches)} stretches of the inertial log look {kind}; "
             "tracked points do not confirm it, and their frames were excluded from the fits"
-        )
+            for kind in denied
+        ]
+        found.model = bridges.without(found.model)
+        if others:
+            doubtful = Doubtful.over(others, evidence.observed, bare.profile)
+            with_bridges(found, Bridges.over(doubtful, evidence.observed, capture, bare.profile), capture)
+            return
         rest = make_evidence(evidence.imu, bridges.doubtful.for_ladder(evidence.observed), bare.profile)
-        _refit(found, rest, bridges.without(found.model), terms)
+        _refit(found, rest, found.model, terms)
         return
     trusted: Mask = np.asarray(~tested.near[~tested.holds].any(axis=0))
     kept = evidence.observed.chosen(trusted) if trusted.sum() >= LEAST_PAIRS_LEFT else evidence.observed

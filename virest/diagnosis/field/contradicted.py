@@ -31,7 +31,7 @@ from virest.inference.doubtful_log import CONTRADICTED, Stretch
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import robust_std
 
-MAX_P = 1e-3
+FALSE_ALARM = 1e-3
 """False-alarm probability, per capture, of a pair that stands out; also that of a knot of a trial bridge."""
 AT_LIMIT, LEAST_AT_LIMIT = 0.02, 3
 """Readings within this part of an axis's largest are at its limit; least number of intervals that reach it.  Those of
@@ -80,10 +80,12 @@ def contradicted_stretches(found: GeometricVerdict, capture: Capture, start: Cam
     observed = evidence.observed
     distance = evidence.distances(found.fit, found.table, found.fit.depth_spread_per_m)
     spans = _spans(observed, model, pair_medians(distance, found.table, len(observed.pairs)))
-    whole = Bridges.over(Doubtful.over(spans, observed, start), observed, capture, start)
-    if not spans or (~whole.doubtful.hit).sum() < LEAST_PAIRS_LEFT:
+    if not spans:
         return []
-    trimmed = whole.trimmed(model, chi2_below(1 - MAX_P, 3))
+    whole = Bridges.over(Doubtful.over(spans, observed, start), observed, capture, start)
+    if (~whole.doubtful.hit).sum() < LEAST_PAIRS_LEFT:
+        return []
+    trimmed = whole.trimmed(model, chi2_below(1 - FALSE_ALARM, 3))
     if not trimmed:
         return []
     bridges = Bridges.over(Doubtful.over(trimmed, observed, start), observed, capture, start)
@@ -119,11 +121,12 @@ def _spans(observed: ObservedTracks, model: Model, medians: Array) -> list[Stret
     stamp_s = observed.stamp_s + (np.array(model.lag) if model.lag else 0.0)
     begin_s, end_s = replace(observed, stamp_s=stamp_s).spans_s(model.profile)
     spans: list[Stretch] = []
-    for pair in np.flatnonzero(deviation > normal_deviate(MAX_P / max(len(medians), 1))):
-        p_value = min(len(medians) * normal_tail(deviation[pair]), 1.0)
-        from_s, to_s = float(begin_s[pair]), float(end_s[pair])
-        if spans and from_s <= spans[-1].to_s:
+    for pair in np.flatnonzero(deviation > normal_deviate(FALSE_ALARM / max(len(medians), 1))):
+        by_chance = min(len(medians) * normal_tail(deviation[pair]), 1.0)
+        own = Stretch(CONTRADICTED, float(begin_s[pair]), float(end_s[pair]), (0, 1, 2), p_value=by_chance)
+        if spans and own.from_s <= spans[-1].to_s:
             last = spans.pop()
-            from_s, p_value = last.from_s, min(p_value, last.p_value or 1.0)
-        spans.append(Stretch(CONTRADICTED, from_s, to_s, (0, 1, 2), p_value=p_value))
+            assert last.p_value is not None
+            own = replace(own, from_s=last.from_s, p_value=min(by_chance, last.p_value))
+        spans.append(own)
     return spans
