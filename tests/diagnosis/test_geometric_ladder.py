@@ -13,6 +13,8 @@ from motion.synthetic_tracks import Recording, Setup
 from virest.camera.gyro_filter import delay_s
 from virest.camera.profile import CameraProfile
 from virest.diagnosis import candidates
+from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
+from virest.diagnosis.cross_validation import Judged, judge, screen
 from virest.diagnosis.findings import Finding, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import (
@@ -27,10 +29,11 @@ from virest.diagnosis.geometric_evidence import (
     make_evidence,
 )
 from virest.diagnosis.geometric_findings import findings_of
-from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.geometric_ladder import _is_simpler, climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.effects.changes import rotation_between
 from virest.inference import profile_terms as terms_of
+from virest.inference.parallel import one_by_one
 from virest.motion.scene_motion import DirectedMotion, InertialMotion
 
 EFFECT = {effect.name: effect for effect in GEOMETRIC_EFFECTS}
@@ -214,6 +217,45 @@ def test_a_gyroscope_filter_of_another_family_is_a_delay_and_an_average(
     assert abs(width.estimate - averaging_s) < 4 * width.std < 0.2 * averaging_s
     if late_s:
         assert delay_s(told["gyro_lowpass"].estimate) == pytest.approx(late_s, rel=0.03)
+
+
+@pytest.mark.parametrize("plane_factor", [-3.0, 0.01])
+def test_a_judged_cause_does_not_depend_on_where_its_scene_began(plane_factor: float) -> None:
+    """From a plane behind the camera, or too far by 100, a fit ends elsewhere; it takes over the better scene."""
+    profile, given = replace(recorded(WALL).profile, depth_m=None), evidence(WALL)
+    start = Model(profile, None, ())
+    scene = base_scene(given, profile, given.table(start, SCREEN_POINTS))
+    assert isinstance(scene, InertialMotion)
+    astray = replace(scene, plane_per_m=plane_factor * scene.plane_per_m, velocity_m_s=scene.velocity_m_s + 3.0)
+    begun = [Candidate(name, replace(start, scene=own), (), None) for name, own in (("near", scene), ("far", astray))]
+    near, far = judge(given, screen(given, begun, one_by_one), 1.0, 0.0, one_by_one)
+    assert far.rms == pytest.approx(near.rms, rel=0.01)
+    assert near.rms < 1.2
+
+
+@pytest.mark.parametrize(
+    ("name", "gained", "rms", "simpler"),
+    [
+        ("time_offset", 3.2, 1.10, True),
+        ("time_offset", 3.2, 1.20, False),
+        ("time_offset", 2.5, 1.10, False),
+        ("clock_skew", 3.2, 1.10, False),
+    ],
+    ids=["nearly as good", "leaves more than tracking errors", "gains less", "no simpler alternative"],
+)
+def test_a_simpler_cause_may_leave_what_tracking_errors_leave(
+    name: str, gained: float, rms: float, simpler: bool
+) -> None:
+    """Blocks that agree on 0.2 of the noise do not exclude it; on 0.5 they do."""
+    model = Model(recorded(HAND).profile, None, ())
+
+    def judged(cause: str, loss_left: float, rms_left: float) -> Judged:
+        losses = np.full(12, loss_left)
+        return Judged(Candidate(cause, model, (), None), losses, losses, losses, rms_left)
+
+    before, best = judged("", 3.5, 10.0), judged("gyro_lowpass", 0.2, 1.07)
+    gain = before.block_loss - best.block_loss
+    assert _is_simpler(before, best, judged(name, 3.5 - gained, rms), gain) is simpler
 
 
 def test_axes_that_differ_are_named_and_neither_lens_nor_focal_length_is(gyroscopes: None) -> None:

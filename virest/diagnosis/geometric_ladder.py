@@ -388,9 +388,9 @@ def _is_simpler(before: Judged, best: Judged, other: Judged, gain: Array) -> boo
 
     Blocks share these errors: their statistics alone would tell two causes apart by 0.03 px of a tracker's own bias.
     """
-    beyond = np.sqrt(max(other.rms**2 - best.rms**2, 0.0))
-    nearly = (before.block_loss - other.block_loss).mean() > MOST_GAIN * gain.mean()
-    return other.candidate.name == SIMPLER.get(best.candidate.name) and beyond < STRUCTURE_NOISES and bool(nearly)
+    beyond = float(np.sqrt(max(other.rms**2 - best.rms**2, 0.0)))
+    part = float((before.block_loss - other.block_loss).mean() / gain.mean())
+    return other.candidate.name == SIMPLER.get(best.candidate.name) and part > MOST_GAIN and beyond < STRUCTURE_NOISES
 
 
 def _rival_step(model: Model, trial: Trial, others: Sequence[Judged], part: float) -> _Step | None:
