@@ -372,6 +372,14 @@ def test_a_badly_tracked_pair_is_no_interval_of_the_log(rng: np.random.Generator
     assert not contradicted_stretches(found, phone.capture, phone.profile)
 
 
+@pytest.mark.parametrize("late_s", [0.02, 0.05])
+def test_frames_that_are_late_are_no_interval_of_the_log(late_s: float) -> None:
+    """A free rate imitates frames at other times, but leaves their points more than noise."""
+    late = Strange(late_in_frame_s=lambda fraction, stamp_s: np.where((stamp_s > 1.0) & (stamp_s < 1.2), late_s, 0.0))
+    verdict, _ = judged(StrangePhone(replace(HAND, seed=77), late), StrangePhone(HAND, Strange()).profile)
+    assert not any(isinstance(entry, Distrusted) for entry in verdict.fields)
+
+
 def test_a_clipping_gyroscope_is_found_with_its_limit() -> None:
     """The limit is reported, and the peaks are bridged."""
     phone = StrangePhone(replace(HAND, seed=78), Strange(gyro=lambda t, reading, _: np.clip(reading, -1.4, 1.4)))

@@ -285,7 +285,8 @@ def _holds(before: float, after: float, noise: float) -> bool:
 
 
 def _convicted(before: float, after: float, usual: float) -> bool:
-    return before > MAX_RMS_RATIO * usual and _removes_excess(before, after, usual)
+    """A log that is wrong leaves nothing but noise once the rate is free: anything more has another cause."""
+    return before > MAX_RMS_RATIO * usual > after and _removes_excess(before, after, usual)
 
 
 def _removes_excess(before: float, after: float, noise: float) -> bool:

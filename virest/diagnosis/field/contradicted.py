@@ -73,13 +73,17 @@ def _climbed(
 def contradicted_stretches(found: GeometricVerdict, capture: Capture, start: CameraProfile) -> list[Stretch]:
     """Intervals whose pairs stand out after a ladder, and where a free rate explains points that it was not fitted to.
 
-    Each reaches from the last knot of a trial bridge that agrees with the log to the next that does.
+    Each reaches from the last knot of a trial bridge that agrees with the log to the next that does.  Frames of a
+    recorder's start-up, which are late, are no evidence against the log.
     """
     evidence, model = found.evidence, found.model
     assert evidence is not None
     observed = evidence.observed
     distance = evidence.distances(found.fit, found.table, found.fit.depth_spread_per_m)
-    spans = _spans(observed, model, pair_medians(distance, found.table, len(observed.pairs)))
+    medians = pair_medians(distance, found.table, len(observed.pairs))
+    late = {frame.index for frame in capture.frames if frame.only_startup}
+    medians[[bool({pair.first, pair.second} & late) for pair in observed.pairs]] = np.nan
+    spans = _spans(observed, model, medians)
     if not spans:
         return []
     whole = Bridges.over(Doubtful.over(spans, observed, start), observed, capture, start)
@@ -113,7 +117,7 @@ def _common_limit(imu: ImuSamples, stretches: list[Stretch]) -> float | None:
 def _spans(observed: ObservedTracks, model: Model, medians: Array) -> list[Stretch]:
     """Intervals, IMU clock, seen by runs of pairs whose median residuals (pairs,) are outliers among all pairs'.
 
-    The logarithm of a pair's median is taken for normally distributed.
+    The logarithm of a pair's median is taken for normally distributed; nan: the pair does not count.
     """
     level = np.log(np.maximum(medians, np.finfo(float).tiny))
     level -= np.nanmedian(level)
