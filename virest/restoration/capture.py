@@ -107,7 +107,7 @@ class RestorationPlan:
         if self.copy_reason is not None:
             return 0
         joined = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
-        return max(joined, 0 if self.missing_turn is None else 1)
+        return max(joined, 0 if self.missing_turn is None and self.settings.deblur == "none" else 1)
 
     def joined(self, before: Sequence[Sight], after: Sequence[Sight]) -> tuple[Sight, ...]:
         """The neighbours that may take part in a frame's joint restoration, in movie order."""
@@ -174,12 +174,15 @@ def restore_frames(
         if plan.contradicted is not None:
             moved = translations.get(frame.index)
             seen = moved_over_frame(trajectory, lens, frame, plan.settings.reference, moved, plan.contradicted)
-        refined, pictures = None, None
+        refined, compared = None, None
         if neighbours is not None:
             refined = neighbours.refined(before, here, after)
-            pictures = partial(
-                neighbours.pictures, plan.joined(before, after), here, refined, plan.settings.most_joined
-            )
+            joined = plan.joined(before, after)
+            if joined and plan.settings.most_joined:
+                compared = partial(neighbours.joined, joined, here, refined, plan.settings.most_joined)
+            else:
+                adjacent = (*before[-1:], *after[:1])
+                compared = partial(neighbours.checked, adjacent, here, refined, plan.settings.min_blur_px)
         unmasked = None if here.recorded is None else here.picture
         yield restore_frame(
             frame,
@@ -190,7 +193,7 @@ def restore_frames(
             seen,
             refined,
             plan.confirmed,
-            pictures,
+            compared,
             unmasked,
             here.coding_step,
             plan.undetected_rad_s,

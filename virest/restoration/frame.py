@@ -27,7 +27,7 @@ from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_harms, straightening_harms
 from virest.restoration.neighbours.confirmation import ConfirmedGain
-from virest.restoration.neighbours.joint import JoinedNeighbours, NeighbourPicture, joined_neighbours, static_part
+from virest.restoration.neighbours.joint import ComparedNeighbours, JoinedNeighbours, joined_neighbours, static_part
 from virest.restoration.neighbours.own_motion import own_motion
 from virest.restoration.neighbours.refinement import RefinedMotion, unrefined_path_std_px
 from virest.restoration.parameters import (
@@ -55,8 +55,9 @@ NOTHING_LEFT = "straightening would leave no recorded pixel (check lens, axes an
 MIN_RELIGHT = 0.002
 """Skip illumination corrections below this relative change: they are less than half a grey level everywhere."""
 
-NeighbourFinder = Callable[[PictureStatistics, Callable[[Array], KernelField]], tuple[NeighbourPicture, ...]]
-"""Select the neighbours to restore a frame with, from the statistics of its luma and its kernels."""
+NeighbourFinder = Callable[[PictureStatistics, Callable[[Array], KernelField]], ComparedNeighbours]
+"""Compare a frame's neighbours with it, and select those to restore it with, from its luma's statistics and its
+kernels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,11 +301,14 @@ def _deblurred(
         return as_shown, None, (why_not,)
     blurred = blurred_picture(picture, curve, (measured.luma, measured.chroma), measured.field, blur.longest_px)
     together = neighbours is not None and blur.anchor == 0.5
-    found = neighbours(measured.luma, measured.field) if together and neighbours is not None else ()
-    if (own := own_motion(found)) is not None:
-        found = own.of_neighbours(found)
+    compared = ComparedNeighbours()
+    if together and neighbours is not None:
+        compared = neighbours(measured.luma, measured.field)
+    pictures = compared.pictures
+    if (own := own_motion(compared.registrations)) is not None:
+        pictures = own.of_neighbours(pictures)
         blurred = replace(blurred, field=own.kernels(blurred.field, blur.motion.exposure_s))
-    joined = joined_neighbours(found, measured.luma_model)
+    joined = joined_neighbours(pictures, measured.luma_model)
     longest_px = max((blur.longest_px, *(one.longest_px for one in joined.registrations)))
     if own is not None:
         longest_px = max(longest_px, float(blurred.field(own.tiles_px).length_px.max()))
@@ -316,7 +320,7 @@ def _deblurred(
     if joined.pictures:
         settings = replace(settings, iterations=min(settings.iterations, settings.joined_iterations))
     sharp = keep_unmeasured(deblur(blurred, settings), recorded, blurred)
-    touched, part = _blend_weights(blur, settings, blurred, measured, joined, confirmed)
+    touched, part = _blend_weights(blur, settings, blurred, measured, compared, confirmed)
     restored = _blended(sharp, recorded, part)
     changed = 0.0 if confirmed is None else _mean_square(restored, recorded)
     details = _details(blur, settings, measured, joined, confirmed, changed)
@@ -357,7 +361,7 @@ def _blend_weights(
     settings: RestorationSettings,
     blurred: BlurredPicture,
     measured: _BlurStatistics,
-    joined: JoinedNeighbours,
+    compared: ComparedNeighbours,
     confirmed: ConfirmedGain | None,
 ) -> tuple[NDArray[np.float32] | np.float32, NDArray[np.float32] | np.float32]:
     """Masks of the blurred regions and of the deblurred picture's weight, each 0 to 1.
@@ -370,7 +374,7 @@ def _blend_weights(
     touched = blurred_part(blur.motion, settings.min_blur_px, settings.tile_px if by_tile else 0)
     part, seen = touched * share_map(blurred, measured.share), measured_share(blurred)
     part = part if seen is None else part * seen
-    still = static_part(joined.registrations)
+    still = static_part(compared.registrations)
     if still is not None and still.min() < 1:
         height, width = blurred.light[0].shape
         part = part * cv2.resize(still, (width, height), interpolation=cv2.INTER_LINEAR)

@@ -206,6 +206,18 @@ def test_moving_objects_do_not_become_worse(simulated):
     assert joint.mean() > max(single.mean() + 0.3, all_taken.mean())
 
 
+@pytest.mark.scenario
+def test_moving_objects_do_not_become_worse_in_frames_restored_alone(simulated, monkeypatch):
+    """Adjacent frames show what moves, and the static scene gains as before; in a static one none is compared."""
+    capture = simulated(moving_px_s=240.0)
+    plan = replace(capture.plan(PRESETS["fast"]), confirmed=None)
+    checked = _gains(capture, plan)
+    monkeypatch.setattr("virest.restoration.neighbours.sights.moves_on_its_own", lambda *_: False)
+    unchecked = _gains(capture, plan)
+    assert checked.min() > -0.1
+    assert checked.mean() > unchecked.mean() + 0.1
+
+
 def test_a_frame_does_not_depend_on_the_rest_of_the_movie(simulated):
     """Its bytes are the same from the whole movie and from its neighbours alone."""
     capture = simulated()

@@ -17,7 +17,7 @@ from virest.app.simulate import simulate_command
 from virest.evaluation.fidelity import psnr_db
 from virest.image_formation.kernels import KernelField
 from virest.restoration.capture import RestorationPlan
-from virest.restoration.neighbours.own_motion import OwnMotion, own_motion
+from virest.restoration.neighbours.own_motion import OwnMotion, moves_on_its_own, own_motion
 from virest.restoration.settings import PRESETS
 
 Array = NDArray[np.float64]
@@ -33,8 +33,9 @@ def seen_from(frames: tuple[int, ...], rng: np.random.Generator, noise_px: float
         precision, apart_s = np.full(len(TILES_PX), 5.0), np.full(len(TILES_PX), apart / 30)
         if number == 0:
             shift_px[1], precision[1] = 40.0, 0.0
-        seen = SimpleNamespace(centres_px=TILES_PX, own_shift_px=shift_px, precision=precision, apart_s=apart_s)
-        found.append(SimpleNamespace(registration=seen))
+        found.append(
+            SimpleNamespace(centres_px=TILES_PX, own_shift_px=shift_px, precision=precision, apart_s=apart_s)
+        )
     return found
 
 
@@ -52,10 +53,44 @@ def test_speeds_grow_with_the_time_between_frames(rng: np.random.Generator) -> N
 def test_shifts_that_do_not_grow_with_time_are_no_speed(rng: np.random.Generator) -> None:
     """A periodic texture is matched one period off in one neighbour."""
     found = seen_from((-1, 1, 2), rng)
-    found[-1].registration.own_shift_px[4] = (6.0, 0.0)  # by least squares 60 px/s
+    found[-1].own_shift_px[4] = (6.0, 0.0)  # by least squares 60 px/s
     own = own_motion(found)
     assert own is not None
     assert not own.speed_px_s[4].any()
+
+
+def plane(rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A textured picture, 400 × 300."""
+    rough = cv2.GaussianBlur(rng.uniform(0, 1, (300, 400)), (0, 0), 2.0)
+    return np.asarray(cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U))
+
+
+def moved(picture: NDArray[np.uint8], matrix: Array) -> NDArray[np.uint8]:
+    """The picture warped by an affine map (2, 3)."""
+    return np.asarray(cv2.warpAffine(picture, matrix, picture.shape[::-1], borderMode=cv2.BORDER_REFLECT))
+
+
+@pytest.mark.parametrize(
+    ("width_px", "path_px", "errs", "expected"),
+    [(0, 0.0, 0.0, False), (70, 2.0, 0.0, True), (70, 0.7, 0.0, False), (0, 0.0, 0.02, False)],
+    ids=["static", "moving figure", "short of the least path", "wrong roll"],
+)
+def test_a_moving_figure_is_told_from_errors_of_the_prediction(
+    rng: np.random.Generator, width_px: int, path_px: float, errs: float, expected: bool
+) -> None:
+    """A rectangle that slides over the background, and a background that turns by 0.02 rad more than predicted."""
+    exposure_s, apart_s = 0.012, 1 / 30
+    first = plane(rng)
+    second = moved(first, cv2.getRotationMatrix2D((200, 150), float(np.degrees(errs)), 1.0))
+    shift_px = path_px * apart_s / exposure_s
+    figure = np.s_[60:240, 150 : 150 + width_px]
+    second[figure] = moved(first, np.array([[1, 0, shift_px], [0, 1, 0]]))[figure]
+    view: Any = SimpleNamespace(
+        frame=SimpleNamespace(exposure_s=exposure_s),
+        places_px=lambda points_px: points_px,
+        apart_s=lambda points_px: np.full(len(points_px), apart_s),
+    )
+    assert moves_on_its_own(view, first, second, 1.0) == expected
 
 
 @pytest.mark.parametrize("anchor", [0.0, 0.5])

@@ -80,7 +80,7 @@ class ShiftField:
 
     def at(self, points_px: Array) -> Array:
         """The shift at points (..., 2)."""
-        return _at(self.affine, points_px) + between_tiles(self.rest_px, self.centres_px, points_px)
+        return affine_at(self.affine, points_px) + between_tiles(self.rest_px, self.centres_px, points_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +151,16 @@ class NeighbourPicture:
     """(height, width) luma of its linear light, scaled to the frame's brightness."""
     half_light: Image
     """(height / 2, width / 2, 3), rounded up: its linear light in colour, scaled to the frame's brightness."""
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedNeighbours:
+    """A frame's neighbours: those compared with it, and those of them with which it is restored."""
+
+    registrations: tuple[NeighbourRegistration, ...] = ()
+    """Of all that were compared: they show what moves on its own."""
+    pictures: tuple[NeighbourPicture, ...] = ()
+    """Those that are joined."""
 
 
 def register_neighbour(
@@ -326,8 +336,11 @@ def _halved(source_px: NDArray[np.float32]) -> NDArray[np.float32]:
     return (half_size(source_px) + np.float32(0.5)) / np.float32(HALF) - np.float32(0.5)
 
 
-def _affine(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array, float]:
-    """Robust fit of coefficients (3, 2) of 1, x, y, with Huber's weights, and the residuals' deviation per axis."""
+def affine_fit(centres_px: Array, shift_px: Array, precision: Array) -> tuple[Array, float]:
+    """Robust fit to shifts (n, 2) at points (n, 2), with Huber's weights.
+
+    Returns the coefficients (3, 2) of 1, x, y, and the residuals' standard deviation per axis.
+    """
     design = np.column_stack([np.ones(len(centres_px)), centres_px])
     robust = np.ones(len(design))
     for _ in range(ROBUST_STEPS):
@@ -348,8 +361,8 @@ def _shift_field(agreement: TileAgreement, used: Mask) -> tuple[ShiftField, floa
     doi:10.1002/9781119115151).
     """
     centres_px, side_px = agreement.centres_px, float(TILE * agreement.times)
-    affine, typical_px = _affine(centres_px[used], agreement.shift_px[used], agreement.precision[used])
-    off_px = agreement.shift_px[used] - _at(affine, centres_px[used])
+    affine, typical_px = affine_fit(centres_px[used], agreement.shift_px[used], agreement.precision[used])
+    off_px = agreement.shift_px[used] - affine_at(affine, centres_px[used])
     doubt = np.maximum(1.0, np.linalg.norm(off_px, axis=1) / (HUBER * typical_px)) ** 2
     apart = np.linalg.norm(centres_px[:, None] - centres_px, axis=-1) / side_px
     common_px, noise_px, reach = _likeliest_field(off_px, doubt, apart[np.ix_(used, used)])
@@ -392,5 +405,6 @@ def between_tiles(values: Array, tiles_px: Array, points_px: Array) -> Array:
     return np.concatenate(found).reshape(points_px.shape[:-1] + values.shape[1:]).astype(float)
 
 
-def _at(affine: Array, points_px: Array) -> Array:
+def affine_at(affine: Array, points_px: Array) -> Array:
+    """An affine map, coefficients (3, 2) of 1, x, y, at points (..., 2)."""
     return np.asarray(affine[0] + points_px @ affine[1:])

@@ -12,15 +12,30 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from virest.arrays import Array
+from virest.arrays import Array, Picture
 from virest.image_formation.kernels import KernelField
+from virest.image_formation.neighbour import NeighbourView
 from virest.inference.chance import chi2_median
-from virest.restoration.neighbours.joint import NeighbourPicture, NeighbourRegistration, between_tiles
+from virest.inference.tracking import TrackingSettings, track_pairs
+from virest.restoration.neighbours.joint import (
+    NeighbourPicture,
+    NeighbourRegistration,
+    affine_at,
+    affine_fit,
+    between_tiles,
+)
 
 FALSE_ALARM = 1e-3
 """Probability of a speed in a tile that has none, for normal noise.  Shifts err more often: of the tiles of a static
 scene (2880, a phone capture simulated outside) 4 % get a speed, 0.1 % one of more than 0.35 px per exposure."""
+
+FEW_POINTS = TrackingSettings(halve_above_px=400, points_per_cell=2)
+"""The points that tell whether anything moves on its own."""
+ADJACENT, FOLLOWING, LEAST_POINTS = 4, 3, 3
+"""A point moves if three of the four next to it follow, to half of its path; three such points are content that moves.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +70,27 @@ class OwnMotion:
         return replace(one, field=self.kernels(one.field, one.view.neighbour.exposure_s))
 
 
-def own_motion(found: Sequence[NeighbourPicture]) -> OwnMotion | None:
+def moves_on_its_own(view: NeighbourView, first: Picture, second: Picture, least_px: float) -> bool:
+    """Whether content of a frame moves by more than ``least_px`` per exposure against the predicted motion.
+
+    Points of the frame's luma (height, width) are tracked into a neighbour's.  Smooth errors of the prediction are no
+    motion of the content, so an affine part is taken off.  Points that adjacent ones do not follow are errors.
+    """
+    pairs = track_pairs([(0, first), (1, second)], FEW_POINTS)
+    if not pairs or len(pairs[0]) <= ADJACENT:
+        return False
+    here_px = pairs[0].points_first_px
+    shift_px = pairs[0].points_second_px - view.places_px(here_px)
+    affine, _ = affine_fit(here_px, shift_px, np.ones(len(here_px)))
+    path_px = view.frame.exposure_s * (shift_px - affine_at(affine, here_px)) / view.apart_s(here_px)[:, None]
+    length_px = np.linalg.norm(path_px, axis=1)
+    _, near = cKDTree(here_px).query(here_px, ADJACENT + 1)
+    alike = np.linalg.norm(path_px[near[:, 1:]] - path_px[:, None], axis=2) < 0.5 * length_px[:, None]
+    moving = (length_px > least_px) & (np.count_nonzero(alike, axis=1) >= FOLLOWING)
+    return int(np.count_nonzero(moving)) >= LEAST_POINTS
+
+
+def own_motion(registrations: Sequence[NeighbourRegistration]) -> OwnMotion | None:
     """The speeds of the tiles that two or more neighbours show; None where no tile is seen that often.
 
     The speed is the least-squares slope of a tile's shifts over the times between the frames.  Its variance follows
@@ -64,7 +99,6 @@ def own_motion(found: Sequence[NeighbourPicture]) -> OwnMotion | None:
     tiles counts as 0, and a larger one loses less.  Where a neighbour shows x + d at the predicted position of x, the
     content of x has moved by -d.
     """
-    registrations = [one.registration for one in found]
     if len(registrations) < 2:
         return None
     shift_px = np.array([one.own_shift_px for one in registrations])
@@ -77,7 +111,7 @@ def own_motion(found: Sequence[NeighbourPicture]) -> OwnMotion | None:
     often = freedom[:, 0] > 0
     if not often.any():
         return None
-    medians = np.array([chi2_median(max(n, 1)) for n in range(len(found))])
+    medians = np.array([chi2_median(max(n, 1)) for n in range(len(registrations))])
     usual_px2 = np.median((left_px2 / medians[np.maximum(freedom, 0)])[often])
     variance = (np.maximum(left_px2 / np.maximum(freedom, 1), usual_px2) / lever_s2).sum(axis=1)
     by_chance = -np.log(FALSE_ALARM) * variance  # squared length of a speed that is noise: chi-square of two freedoms

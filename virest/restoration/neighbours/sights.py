@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.arrays import Array
+from virest.arrays import Array, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
 from virest.capture.pixels import BT601_LUMA
@@ -20,13 +20,13 @@ from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import kernel_spread
 from virest.image_formation.kernels import KernelField, kernel_field
 from virest.image_formation.light import flicker_of_rows, frame_light
-from virest.image_formation.neighbour import neighbour_view
+from virest.image_formation.neighbour import NeighbourView, neighbour_view
 from virest.image_formation.row_clock import ROW_MIDDLE
 from virest.image_formation.row_motion import RowMotion
 from virest.motion.optics import MovingLens
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.joint import (
-    NeighbourPicture,
+    ComparedNeighbours,
     NeighbourRegistration,
     half_size,
     is_detailed,
@@ -35,6 +35,7 @@ from virest.restoration.neighbours.joint import (
     resample_neighbour,
     rings_passed,
 )
+from virest.restoration.neighbours.own_motion import moves_on_its_own
 from virest.restoration.neighbours.reduced_tiles import reduced, reduced_light
 from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
 from virest.restoration.neighbours.registration import (
@@ -123,7 +124,34 @@ class FrameNeighbours:
         turns = [self.turn(first, second) for first, second in pairwise((*before, here, *after))]
         return self._missing.refined(here.motion, turns[: len(before)][::-1], turns[len(before) :], self._trajectory)
 
-    def pictures(
+    def checked(
+        self,
+        adjacent: Sequence[Sight],
+        here: Sight,
+        refined: RefinedMotion | None,
+        least_px: float,
+        luma: PictureStatistics,
+        field: Callable[[Array], KernelField],
+    ) -> ComparedNeighbours:
+        """Compare a frame that is restored alone with adjacent ones, if anything in it moves on its own.
+
+        Points tracked into one of them tell: they cost a tenth of the comparison.  least_px: path per exposure that
+        matters; see :func:`moves_on_its_own`.  luma, field: see :meth:`joined`.
+        """
+        assert here.motion is not None
+        usable = [other for other in adjacent if other.usable and not _same_instant(here.motion, other.motion)]
+        if not usable:
+            return ComparedNeighbours()
+        view = self._view(here, usable[0], refined)
+        if not moves_on_its_own(view, _luma(here), _luma(usable[0]), least_px):
+            return ComparedNeighbours()
+        tiles = frame_tiles(self.light(here), here.motion.profile, field, everywhere=True)
+        if tiles is None:
+            return ComparedNeighbours()
+        found = (self._registration(here, other, refined, tiles, luma) for other in usable)
+        return ComparedNeighbours(tuple(one for one in found if one is not None))
+
+    def joined(
         self,
         around: Sequence[Sight],
         here: Sight,
@@ -131,7 +159,7 @@ class FrameNeighbours:
         most: int,
         luma: PictureStatistics,
         field: Callable[[Array], KernelField],
-    ) -> tuple[NeighbourPicture, ...]:
+    ) -> ComparedNeighbours:
         """Register at most ``most`` of a frame's neighbours, chosen by how much they reduce the ideal filter's error.
 
         A neighbour's weight is first predicted from its distance in frames.  Once registered, the measured weight
@@ -142,8 +170,8 @@ class FrameNeighbours:
         """
         assert here.motion is not None
         left = {other.frame.index: other for other in around if other.usable and other.frame.index != here.frame.index}
-        if not left or not most:
-            return ()
+        if not left:
+            return ComparedNeighbours()
         tiles = frame_tiles(self.light(here), here.motion.profile, field, everywhere=True)
         found: dict[int, NeighbourRegistration] = {}
         taken: list[int] = []
@@ -169,7 +197,8 @@ class FrameNeighbours:
                     passed[other] = passed[other] * share
             passed[number] = measured
         detailed = {n: is_detailed(replace(luma, passed=self._passed[n])) for n in taken}
-        return tuple(resample_neighbour(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
+        pictures = (resample_neighbour(found[n], *self._full_of(sights[n]), detailed[n]) for n in sorted(taken))
+        return ComparedNeighbours(tuple(found[n] for n in sorted(taken)), tuple(pictures))
 
     def _registration(
         self, here: Sight, other: Sight, refined: RefinedMotion | None, tiles: FrameTiles, luma: PictureStatistics
@@ -177,8 +206,7 @@ class FrameNeighbours:
         """Register a neighbour to the frame; None if it shows different content or its path is too long."""
         assert here.motion is not None
         assert other.motion is not None
-        curve, further = here.motion.profile.curve, refined.further if refined else None
-        view = neighbour_view(here.motion, other.motion, self._trajectory, self._lens, further=further)
+        curve, view = here.motion.profile.curve, self._view(here, other, refined)
         along = view.field()
         agreement = tile_agreement(view, tiles, along, self.light(other))
         if agreement is None:
@@ -194,6 +222,12 @@ class FrameNeighbours:
             profile, of_path = here.motion.profile, replace(refined, motion=other.motion).path_covariance_px2()
             spread = kernel_spread(along, profile.width, profile.height, of_path)
         return replace(registration, coding_noise_ratio=_coding_noise_ratio(other, here), spread=spread)
+
+    def _view(self, here: Sight, other: Sight, refined: RefinedMotion | None) -> NeighbourView:
+        assert here.motion is not None
+        assert other.motion is not None
+        further = refined.further if refined else None
+        return neighbour_view(here.motion, other.motion, self._trajectory, self._lens, further=further)
 
     def with_missing_turn(self, missing: MissingTurn | None) -> FrameNeighbours:
         """A copy with the capture's missing rotation, which shares the pair comparisons made so far."""
@@ -253,10 +287,20 @@ def _coding_noise_ratio(other: Sight, here: Sight) -> float:
     return here.coding_step / other.coding_step
 
 
+def _same_instant(first: RowMotion, second: RowMotion | None) -> bool:
+    """Whether the second frame is a repeat of the first: it shows the same instant."""
+    return second is not None and first.start_s == second.start_s
+
+
+def _luma(sight: Sight) -> Picture:
+    """A frame's luma, (height, width), grey levels."""
+    return sight.picture if sight.picture.ndim == 2 else cv2.cvtColor(sight.picture, cv2.COLOR_RGB2GRAY)
+
+
 def light_of(sight: Sight) -> Image:
     """A frame's luma in linear light, reduced, without flicker."""
     assert sight.motion is not None
-    luma = sight.picture if sight.picture.ndim == 2 else cv2.cvtColor(sight.picture, cv2.COLOR_RGB2GRAY)
+    luma = _luma(sight)
     light, rows = reduced_light(luma, _linear(sight.motion.profile.curve)), flicker_of_rows(sight.motion)
     return light if rows is None else light / reduced(np.broadcast_to(rows, luma.shape))
 
@@ -288,6 +332,6 @@ def turn_between(
         return None
     assert first.motion is not None
     assert second.motion is not None
-    if first.motion.start_s == second.motion.start_s:  # a repeated picture shows the same instant
+    if _same_instant(first.motion, second.motion):
         return None
     return pair_turn(neighbour_view(first.motion, second.motion, trajectory, lens), first_light, second_light)
