@@ -8,6 +8,7 @@ import pytest
 from motion.synthetic_tracks import Recording, Setup, recorded
 
 from virest.camera.profile import CameraProfile, Extensions
+from virest.image_formation.row_clock import right_way_round
 from virest.restoration.profile_conflict import Settled, settle_conflict
 
 HAND = Setup(seed=71, frames=26, points=40, gyro_noise_rad_s=0.002)
@@ -104,6 +105,25 @@ def test_a_stabiliser_and_a_wrong_focal_length_are_separated() -> None:
     found = settled(recording, given)
     assert focal_px(found.profile) == pytest.approx(520.0, rel=0.01)
     assert found.profile.extensions.stabilisation_fraction == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize("only_readout", [False, True])
+@pytest.mark.parametrize("factor", [0.5, 1.4, -1.0], ids=["half", "too long", "reversed"])
+def test_a_wrong_readout_is_corrected(factor: float, only_readout: bool) -> None:
+    """The true readout is found to its deviation, and with an unknown offset the true offset too."""
+    recording = recorded(HAND)
+    true = recording.profile.shutter
+    wrong = right_way_round(recording.profile.with_shutter(readout_time_s=factor * true.readout_time_s))
+    given = replace(wrong, time_offset_s=recording.profile.time_offset_s)
+    found = settle_conflict(recording.observed, recording.imu, given, offset_known=False, only_readout=only_readout)
+    assert len(found.taken) == 1
+    assert "readout time" in found.taken[0]
+    shutter, estimate = found.profile.shutter, found.profile.estimates["readout_time_s"]
+    assert abs(shutter.readout_time_s - true.readout_time_s) < 3 * estimate.std < 1e-3
+    assert shutter.readout_direction == true.readout_direction
+    assert ("readout_direction" in found.profile.estimates) == (factor < 0)
+    assert found.offset is not None
+    assert abs(found.offset[0] - (recording.profile.time_offset_s or 0.0)) < 3 * found.offset[1] < 2e-3
 
 
 @pytest.mark.parametrize(

@@ -123,8 +123,9 @@ def _planned(
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
         plan = _with_clock(plan, profile, alignment)
-    if alignment is None or not explains_points(alignment):
-        settled, followed = settle(plan, profile, capture, tracked)
+    explained = alignment is not None and explains_points(alignment)
+    if not explained or profile.readout_known:
+        settled, followed = settle(plan, profile, capture, tracked, explained=explained)
         if settled.profile is not plan.profile and runs:
             alignment = _aligned(settled.profile, profile, capture, all_pairs)
             settled = _with_clock(settled, profile, alignment)

@@ -37,16 +37,26 @@ def explains_points(alignment: VisualInertialAlignment) -> bool:
 
 
 def settle(
-    plan: RestorationPlan, given: CameraProfile, capture: Capture, pairs: Sequence[TrackPair]
+    plan: RestorationPlan,
+    given: CameraProfile,
+    capture: Capture,
+    pairs: Sequence[TrackPair],
+    *,
+    explained: bool = False,
 ) -> tuple[RestorationPlan, bool]:
     """The plan with contradicted values replaced by those from tracked points, and a note for each.
 
-    The second: whether the points clearly follow the gyroscope, even if the rotations of whole frames do not.
+    explained: the points are explained already, by a fit that takes the stated readout time for right, so only that is
+    tested.  The second: whether the points clearly follow the gyroscope, even if the rotations of whole frames do not.
     """
     offset_known, focal_known = given.time_offset_s is not None, plan.profile.intrinsics is not None
     profile = plan.profile if focal_known else replace(plan.profile, intrinsics=guessed_lens(plan.profile))
     observed = observe_tracks(capture, pairs, profile)
-    found = settle_conflict(observed, capture.imu, profile, offset_known=offset_known, focal_known=focal_known)
+    found = settle_conflict(
+        observed, capture.imu, profile, offset_known=offset_known, focal_known=focal_known, only_readout=explained
+    )
+    if explained and not found.taken:
+        return plan, False
     if found.contradicted and not found.taken and not offset_known:
         begun = _at_coarse_offset(observed, capture, profile)
         if begun is not None:
@@ -57,12 +67,21 @@ def settle(
     if offset_known and not found.taken:
         return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
     if offset_known:
-        plan = replace(plan, profile=found.profile, refusal=None)
+        plan = replace(_at_given_offset(plan, given, found.profile), refusal=None)
         return plan.noted(NoteCode.PROFILE_CONFLICT, *found.taken, *_remaining_note(found)), followed
     open_yet = plan.refuses(NoteCode.TIME_OFFSET, NoteCode.NOT_FOLLOWING, NoteCode.FOCAL_LENGTH)
     if not found.taken and not (followed and (open_yet or found.contradicted)):
         return (plan.noted(NoteCode.PROFILE_CONFLICT, _unexplained(found)) if found.contradicted else plan), followed
     return _with_open_values(plan, found), followed
+
+
+def _at_given_offset(plan: RestorationPlan, given: CameraProfile, found: CameraProfile) -> RestorationPlan:
+    """The plan with the profile found; with another readout, at the given offset, which is tested anew then."""
+    if found.shutter != plan.profile.shutter:
+        estimates = {name: value for name, value in found.estimates.items() if name != "time_offset_s"}
+        found = replace(found, time_offset_s=given.time_offset_s, estimates=estimates)
+        plan = plan.without(NoteCode.OTHER_OFFSET)
+    return replace(plan, profile=found)
 
 
 def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:

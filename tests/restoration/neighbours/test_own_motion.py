@@ -33,9 +33,7 @@ def seen_from(frames: tuple[int, ...], rng: np.random.Generator, noise_px: float
         precision, apart_s = np.full(len(TILES_PX), 5.0), np.full(len(TILES_PX), apart / 30)
         if number == 0:
             shift_px[1], precision[1] = 40.0, 0.0
-        found.append(
-            SimpleNamespace(centres_px=TILES_PX, own_shift_px=shift_px, precision=precision, apart_s=apart_s)
-        )
+        found.append(SimpleNamespace(centres_px=TILES_PX, own_shift_px=shift_px, precision=precision, apart_s=apart_s))
     return found
 
 
