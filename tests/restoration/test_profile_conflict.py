@@ -126,6 +126,18 @@ def test_a_wrong_readout_is_corrected(factor: float, only_readout: bool) -> None
     assert abs(found.offset[0] - (recording.profile.time_offset_s or 0.0)) < 3 * found.offset[1] < 2e-3
 
 
+def test_a_readout_along_the_wrong_axis_is_corrected() -> None:
+    """Columns given as rows."""
+    recording = recorded(HAND)
+    true = recording.profile.shutter
+    wrong = "top_to_bottom" if true.reads_columns else "left_to_right"
+    found = settled(recording, recording.profile.with_shutter(readout_direction=wrong))
+    assert found.profile.shutter.readout_direction == true.readout_direction
+    assert found.profile.shutter.readout_time_s == pytest.approx(true.readout_time_s, abs=5e-4)
+    assert len(found.taken) == 1
+    assert found.after_px < 1.2 * found.noise_px < found.before_px
+
+
 @pytest.mark.parametrize(
     "setup",
     [

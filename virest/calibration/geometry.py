@@ -37,7 +37,7 @@ from virest.capture.records import Capture
 from virest.effects.changes import keep_readout
 from virest.errors import CalibrationError
 from virest.image_formation.point_model import TrackTable, integrate_motion
-from virest.image_formation.row_clock import right_way_round
+from virest.image_formation.row_clock import as_global_shutter, right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.blur_bias import LEFT_BY_EVEN_BLUR, RELATIVE_STD, blur_bias_px, rolling_shift_px
 from virest.inference.chance import student_tail
@@ -321,9 +321,9 @@ def _readout_axis(imu: ImuSamples, table: TrackTable, start: CameraProfile, name
     along = "left_to_right" if start.shutter.reads_columns else "top_to_bottom"
     across = "top_to_bottom" if start.shutter.reads_columns else "left_to_right"
     before = fit_tracks(imu, table, start, wanted[:1], max_iterations=4)
-    first = _fit_with_translation(imu, table, _without_readout(start, along), [*wanted, terms_of.READOUT], asked)
+    first = _fit_with_translation(imu, table, as_global_shutter(start, along), [*wanted, terms_of.READOUT], asked)
     scene, fitted = first.scene, first.terms
-    second = fit_tracks(imu, table, _without_readout(start, across), fitted, scene)
+    second = fit_tracks(imu, table, as_global_shutter(start, across), fitted, scene)
     difference = (first.cost - second.cost) / max(min(first.scale, second.scale) ** 2, 1e-9)
     best = second if difference > 0 else first
     if best is second and best.scene is not None:
@@ -332,13 +332,6 @@ def _readout_axis(imu: ImuSamples, table: TrackTable, start: CameraProfile, name
     log.debug("readout: cost %.1f %s, %.1f %s", first.cost, along, second.cost, across)
     rough = _Rough(best.profile, best.scene, abs(difference) > DIRECTION_COST, before)
     return _with_uneven_rows(rough, start)
-
-
-def _without_readout(profile: CameraProfile, direction: str) -> CameraProfile:
-    """A global shutter at the time of the middle row: the start of a fit for a readout of either sign."""
-    middle = (profile.time_offset_s or 0.0) + 0.5 * profile.shutter.readout_time_s
-    bare = profile.with_shutter(readout_time_s=0.0, readout_direction=direction, uneven=None)
-    return replace(bare, time_offset_s=middle)
 
 
 def _with_uneven_rows(rough: _Rough, given: CameraProfile) -> _Rough:

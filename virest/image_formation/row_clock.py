@@ -123,3 +123,10 @@ def right_way_round(profile: CameraProfile) -> CameraProfile:
     moved = row_time_s(0.0, shutter.readout_time_s, 1 - 1 / rows)
     other = profile.with_shutter(readout_time_s=-shutter.readout_time_s, readout_direction=opposite)
     return replace(other, time_offset_s=(profile.time_offset_s or 0.0) + moved)
+
+
+def as_global_shutter(profile: CameraProfile, direction: str) -> CameraProfile:
+    """A global shutter at the time of the middle row: the start of a fit for a readout of either sign."""
+    middle_s = (profile.time_offset_s or 0.0) + row_time_s(0.0, profile.shutter.readout_time_s, 0.5)
+    bare = profile.with_shutter(readout_time_s=0.0, readout_direction=direction, uneven=None)
+    return replace(bare, time_offset_s=middle_s)

@@ -17,12 +17,12 @@ from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable, integrate_motion
-from virest.image_formation.row_clock import right_way_round
+from virest.image_formation.row_clock import as_global_shutter, right_way_round
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.observed_tracks import ObservedTracks
-from virest.inference.profile_terms import CLOCK_SKEW, careful_terms, shift_offset
+from virest.inference.profile_terms import CLOCK_SKEW, STATED_READOUT, UNKNOWN_READOUT, careful_terms, shift_offset
 from virest.inference.robust import RAYLEIGH_MEDIAN
 from virest.inference.time_blocks import even_blocks, halves
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
@@ -120,6 +120,14 @@ def settle_conflict(
         return _with_readout(found, base, noise_px)
     if only_readout:
         return found
+    across = search.along_other_axis(base)
+    if across is not None and across.scale**2 - 1 < MOST_LEFT * (base.scale**2 - 1):
+        turned = _with_readout(found, across, noise_px)
+        if turned.taken:
+            assert turned.offset is not None
+            begun = turned.profile if offset_known else replace(turned.profile, time_offset_s=turned.offset[0])
+            rest = settle_conflict(observed, imu, begun, offset_known=offset_known, focal_known=focal_known)
+            return replace(rest, contradicted=True, taken=(*turned.taken, *rest.taken), before_px=left_px)
     fit, causes = search.add_causes(base)
     log.debug("points lie %.2f off; %s leave %.2f", base.scale, [cause.name for cause in causes], fit.scale)
     if not causes or fit.scale**2 - 1 > MOST_LEFT * (base.scale**2 - 1):
@@ -142,7 +150,8 @@ def settle_conflict(
 def _with_readout(found: Settled, fit: TrackFit, noise_px: float) -> Settled:
     """The result with the fit's readout and offset, where the points contradict the stated time or direction."""
     stated, fitted = found.profile.shutter, right_way_round(fit.profile)
-    off_s = fit.profile.shutter.readout_time_s - stated.readout_time_s
+    same_axis = fit.profile.shutter.reads_columns == stated.reads_columns
+    off_s = fit.profile.shutter.readout_time_s - (stated.readout_time_s if same_axis else 0.0)
     if not found.profile.readout_known or stated.uneven is not None or abs(off_s) < READOUT_DOUBT_S:
         return found
     std_s = float(np.hypot(fit.std("readout_time")[0], bias_std(fit, "readout_time", noise_px)[0]))
@@ -224,6 +233,16 @@ class _Search:
         table = self.table if use is None else self.table.chosen(use)
         terms = (*self.nuisances, *(cause.term for cause in start.causes))
         return fit_tracks(self.imu, table, start.profile, terms, start.scene, covariances=use is None)
+
+    def along_other_axis(self, base: TrackFit) -> TrackFit | None:
+        """Fit of a readout of either sign along the other axis, columns instead of rows; None: no stated readout."""
+        if not self.given.readout_known or self.given.shutter.uneven is not None:
+            return None
+        direction = "top_to_bottom" if self.given.shutter.reads_columns else "left_to_right"
+        start = as_global_shutter(self.given, direction)
+        terms = tuple(UNKNOWN_READOUT if term is STATED_READOUT else term for term in self.nuisances)
+        scene = None if base.scene is None else self._travel()
+        return fit_tracks(self.imu, self.table, start, terms, scene)
 
     def add_causes(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
         """Add causes one by one; returns the fit with all of them, and the causes."""
