@@ -126,6 +126,13 @@ def test_a_wrong_readout_is_corrected(factor: float, only_readout: bool) -> None
     assert abs(found.offset[0] - (recording.profile.time_offset_s or 0.0)) < 3 * found.offset[1] < 2e-3
 
 
+def test_no_readout_is_longer_than_a_frame() -> None:
+    """Points that such a readout would explain change nothing."""
+    recording = recorded(replace(HAND, readout_time_s=1.3 / 30))
+    given = recording.profile.with_shutter(readout_time_s=0.9 / 30)
+    assert not settled(recording, given).taken
+
+
 def test_a_readout_along_the_wrong_axis_is_corrected() -> None:
     """Columns given as rows."""
     recording = recorded(HAND)

@@ -117,12 +117,12 @@ def settle_conflict(
     found = Settled(profile, False, (), left_px, left_px, noise_px, _offset(base, readout_s, noise_px), motion_px)
     found = found if focal_known else replace(found, focal=_focal(base, noise_px))
     if base.scale < CONTRADICTED:
-        return _with_readout(found, base, noise_px)
+        return search.with_readout(found, base)
     if only_readout:
         return found
     across = search.along_other_axis(base)
     if across is not None and across.scale**2 - 1 < MOST_LEFT * (base.scale**2 - 1):
-        turned = _with_readout(found, across, noise_px)
+        turned = search.with_readout(found, across)
         if turned.taken:
             assert turned.offset is not None
             begun = turned.profile if offset_known else replace(turned.profile, time_offset_s=turned.offset[0])
@@ -144,31 +144,7 @@ def settle_conflict(
     focal = None if focal_known else _focal(fit, noise_px)
     after_px = fit.scale * noise_px
     settled = Settled(resolved, True, messages, left_px, after_px, noise_px, offset, motion_px, focal)
-    return _with_readout(settled, fit, noise_px)
-
-
-def _with_readout(found: Settled, fit: TrackFit, noise_px: float) -> Settled:
-    """The result with the fit's readout and offset, where the points contradict the stated time or direction."""
-    stated, fitted = found.profile.shutter, right_way_round(fit.profile)
-    same_axis = fit.profile.shutter.reads_columns == stated.reads_columns
-    off_s = fit.profile.shutter.readout_time_s - (stated.readout_time_s if same_axis else 0.0)
-    if not found.profile.readout_known or stated.uneven is not None or abs(off_s) < READOUT_DOUBT_S:
-        return found
-    std_s = float(np.hypot(fit.std("readout_time")[0], bias_std(fit, "readout_time", noise_px)[0]))
-    if chi2_tail((off_s / std_s) ** 2, 1) >= VALUE_P:
-        return found
-    readout_s, direction = fitted.shutter.readout_time_s, fitted.shutter.readout_direction
-    profile = found.profile.with_shutter(readout_time_s=readout_s, readout_direction=direction)
-    profile = profile.with_estimate("readout_time_s", readout_s, std_s, SOURCE)
-    text = f"readout time of {readout_s * 1e3:.2f} ± {std_s * 1e3:.2f} ms"
-    instead = f"the profile's {stated.readout_time_s * 1e3:g} ms"
-    if direction != stated.readout_direction:
-        profile = profile.with_estimate("readout_direction", direction, None, SOURCE)
-        text, instead = f"{text} {direction}", f"{instead} {stated.readout_direction}"
-    of_middle_s = _offset(fit, readout_s, noise_px)[1]  # the fit keeps the middle row's time
-    offset = fitted.time_offset_s or 0.0, float(np.hypot(of_middle_s, 0.5 * std_s))
-    taken = (*found.taken, f"{text} used instead of {instead}")
-    return replace(found, profile=profile, contradicted=True, taken=taken, offset=offset)
+    return search.with_readout(settled, fit)
 
 
 def _offset(fit: TrackFit, readout_s: float, noise_px: float) -> tuple[float, float]:
@@ -243,6 +219,34 @@ class _Search:
         terms = tuple(UNKNOWN_READOUT if term is STATED_READOUT else term for term in self.nuisances)
         scene = None if base.scene is None else self._travel()
         return fit_tracks(self.imu, self.table, start, terms, scene)
+
+    def with_readout(self, found: Settled, fit: TrackFit) -> Settled:
+        """The result with the fit's readout and offset, where the points contradict the stated time or direction.
+
+        A readout that takes longer than a frame is none.
+        """
+        stated, fitted = found.profile.shutter, right_way_round(fit.profile)
+        same_axis = fit.profile.shutter.reads_columns == stated.reads_columns
+        off_s = fit.profile.shutter.readout_time_s - (stated.readout_time_s if same_axis else 0.0)
+        if not found.profile.readout_known or stated.uneven is not None or abs(off_s) < READOUT_DOUBT_S:
+            return found
+        noise_px = float(np.median(self.table.noise_px))
+        std_s = float(np.hypot(fit.std("readout_time")[0], bias_std(fit, "readout_time", noise_px)[0]))
+        readout_s, direction = fitted.shutter.readout_time_s, fitted.shutter.readout_direction
+        period_s = float(np.median(self.table.second_stamp_s - self.table.first_stamp_s))
+        if chi2_tail((off_s / std_s) ** 2, 1) >= VALUE_P or readout_s > period_s:
+            return found
+        profile = found.profile.with_shutter(readout_time_s=readout_s, readout_direction=direction)
+        profile = profile.with_estimate("readout_time_s", readout_s, std_s, SOURCE)
+        text = f"readout time of {readout_s * 1e3:.2f} ± {std_s * 1e3:.2f} ms"
+        instead = f"the profile's {stated.readout_time_s * 1e3:g} ms"
+        if direction != stated.readout_direction:
+            profile = profile.with_estimate("readout_direction", direction, None, SOURCE)
+            text, instead = f"{text} {direction}", f"{instead} {stated.readout_direction}"
+        of_middle_s = _offset(fit, readout_s, noise_px)[1]  # the fit keeps the middle row's time
+        offset = fitted.time_offset_s or 0.0, float(np.hypot(of_middle_s, 0.5 * std_s))
+        taken = (*found.taken, f"{text} used instead of {instead}")
+        return replace(found, profile=profile, contradicted=True, taken=taken, offset=offset)
 
     def add_causes(self, base: TrackFit) -> tuple[TrackFit, tuple[Cause, ...]]:
         """Add causes one by one; returns the fit with all of them, and the causes."""

@@ -135,7 +135,7 @@ class FrameNeighbours:
     ) -> ComparedNeighbours:
         """Compare a frame that is restored alone with adjacent ones, if anything in it moves on its own.
 
-        Points tracked into one of them tell: they cost a tenth of the comparison.  least_px: path per exposure that
+        Points tracked into one of them tell, at less than a tenth of its cost.  least_px: path per exposure that
         matters; see :func:`moves_on_its_own`.  luma, field: see :meth:`joined`.
         """
         assert here.motion is not None
