@@ -208,7 +208,7 @@ def test_moving_objects_do_not_become_worse(simulated):
 
 @pytest.mark.scenario
 def test_moving_objects_do_not_become_worse_in_frames_restored_alone(simulated, monkeypatch):
-    """Adjacent frames show what moves, and the static scene gains as before; in a static one none is compared."""
+    """Adjacent frames show what moves, and the static scene still gains."""
     capture = simulated(moving_px_s=240.0)
     plan = replace(capture.plan(PRESETS["fast"]), confirmed=None)
     checked = _gains(capture, plan)

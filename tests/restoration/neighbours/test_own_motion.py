@@ -69,23 +69,23 @@ def moved(picture: NDArray[np.uint8], matrix: Array) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize(
-    ("width_px", "path_px", "errs", "expected"),
+    ("width_px", "path_px", "turned_rad", "expected"),
     [(0, 0.0, 0.0, False), (70, 2.0, 0.0, True), (70, 0.7, 0.0, False), (0, 0.0, 0.02, False)],
     ids=["static", "moving figure", "short of the least path", "wrong roll"],
 )
 def test_a_moving_figure_is_told_from_errors_of_the_prediction(
-    rng: np.random.Generator, width_px: int, path_px: float, errs: float, expected: bool
+    rng: np.random.Generator, width_px: int, path_px: float, turned_rad: float, expected: bool
 ) -> None:
-    """A rectangle that slides over the background, and a background that turns by 0.02 rad more than predicted."""
+    """A rectangle that slides, and a background that turns by 0.02 rad more; some points have no prediction."""
     exposure_s, apart_s = 0.012, 1 / 30
     first = plane(rng)
-    second = moved(first, cv2.getRotationMatrix2D((200, 150), float(np.degrees(errs)), 1.0))
+    second = moved(first, cv2.getRotationMatrix2D((200, 150), float(np.degrees(turned_rad)), 1.0))
     shift_px = path_px * apart_s / exposure_s
     figure = np.s_[60:240, 150 : 150 + width_px]
     second[figure] = moved(first, np.array([[1, 0, shift_px], [0, 1, 0]]))[figure]
     view: Any = SimpleNamespace(
         frame=SimpleNamespace(exposure_s=exposure_s),
-        places_px=lambda points_px: points_px,
+        places_px=lambda points_px: np.where(points_px[:, :1] > 380, np.nan, points_px),
         apart_s=lambda points_px: np.full(len(points_px), apart_s),
     )
     assert moves_on_its_own(view, first, second, 1.0) == expected

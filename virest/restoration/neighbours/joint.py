@@ -155,12 +155,12 @@ class NeighbourPicture:
 
 @dataclass(frozen=True, slots=True)
 class ComparedNeighbours:
-    """A frame's neighbours: those compared with it, and those of them with which it is restored."""
+    """The neighbours that show what in a frame moves on its own, and those with which it is restored."""
 
     registrations: tuple[NeighbourRegistration, ...] = ()
-    """Of all that were compared: they show what moves on its own."""
+    """Of the joined neighbours, or of the adjacent frames if the frame is restored alone."""
     pictures: tuple[NeighbourPicture, ...] = ()
-    """Those that are joined."""
+    """The joined neighbours; empty if the frame is restored alone."""
 
 
 def register_neighbour(
