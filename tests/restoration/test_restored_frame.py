@@ -23,6 +23,7 @@ from virest.restoration.frame import (
     copied_frame,
     restore_frame,
 )
+from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.parameters import degradation_parameters, unknown_parameters
 from virest.restoration.positive_light import blur_along_paths, consistent_light, without_negative_light
 from virest.restoration.settings import DEBLUR_METHODS, PRESETS, RestorationSettings
@@ -565,3 +566,20 @@ def test_waves_in_dark_areas_shrink_to_the_mean_light() -> None:
     assert abs(waves.mean() - 0.02) < 0.005, "0.07 if negative light is only clipped"
     assert waves.max() < 0.08, "0.22 before the correction"
     np.testing.assert_allclose(found[:, 72:], light[:, 72:], rtol=1e-3)  # no negative light within reach: unchanged
+
+
+def test_the_less_the_expected_gain_the_less_of_the_change_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two thirds of the change for a gain of 1 dB, and all of it for 3 dB; the log gives the weight."""
+    turning = camera(reference="frame-middle")
+    recorded = record(turning).picture
+    settings = replace(BALANCED, shutter="none", reference="frame-middle")
+    pictures, shares = [], []
+    for gain_db in (3.0, 1.0):
+        monkeypatch.setattr(ConfirmedGain, "of_change_db", lambda *_, gain_db=gain_db: (gain_db, 0.3))
+        confirmed = ConfirmedGain(1.0, 0.2, 0.02, 4)
+        result = restore_frame(FRAME, recorded, turning.motion, turning.trajectory, settings, confirmed=confirmed)
+        pictures.append(_picture(result).astype(float))
+        shares.append(result.parameters["deblur"]["share"])
+    assert shares == pytest.approx([1.0, 2 / 3])
+    np.testing.assert_allclose(pictures[1] - recorded, 2 / 3 * (pictures[0] - recorded), atol=1.0)
+    assert np.abs(pictures[0] - recorded).mean() > 2

@@ -44,7 +44,14 @@ from virest.restoration.shutter import perspective_map, rounded, rowwise_map, va
 from virest.restoration.statistics.of_picture import measured_centres, picture_statistics
 from virest.restoration.statistics.records import PictureStatistics, coded_variance
 from virest.restoration.statistics.tile_power import FEW_TILES, MANY_TILES
-from virest.restoration.taken_part import LEAST_CONFIRMED_DB, blurred_part, no_gain_reason, share_map, trusted_share
+from virest.restoration.taken_part import (
+    LEAST_CONFIRMED_DB,
+    blurred_part,
+    gaining_share,
+    no_gain_reason,
+    share_map,
+    trusted_share,
+)
 from virest.restoration.undistortion import undistortion_map
 
 MIN_WARP_PX = 0.1
@@ -328,6 +335,10 @@ def _deblurred(
         why_not = no_gain_reason(measured.luma_model, details.expected_gain_db, LEAST_CONFIRMED_DB)
         if why_not:
             return as_shown, None, (why_not,)
+        share = gaining_share(details.expected_gain_db)
+        if blur.anchor == 0.5 and share < details.share:
+            less = share_map(blurred, share / details.share)
+            restored, details = _blended(restored.__getitem__, recorded, less), replace(details, share=share)
     if unmasked is not None:  # unblurred regions keep the phone's sharpening
         restored = _blended(restored.__getitem__, as_shown, touched)
     return restored, details, ()

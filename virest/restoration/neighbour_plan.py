@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +13,7 @@ from virest.capture.folder import Capture
 from virest.capture.join import outside_reason
 from virest.image_formation.blur import Image
 from virest.image_formation.row_motion import RowMotion
-from virest.inference.unsharp_mask import MOST_FRAMES, RESIDUAL_AMOUNT, overshoot, without_mask
+from virest.inference.unsharp_mask import MOST_FRAMES, RESIDUAL_AMOUNT, UnsharpMask, overshoot, without_mask
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import moving_lens
 from virest.restoration.capture import RestorationPlan, at_true_times, moved_over_frame
@@ -20,7 +21,14 @@ from virest.restoration.neighbours.refinement import RefinedMotion, unmeasured_t
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 from virest.restoration.neighbours.survey import path_length_px, survey_gain, survey_turns
 from virest.restoration.settings import PRESETS
-from virest.restoration.trial import try_restoration
+from virest.restoration.trial import blur_error, try_restoration
+
+MOST_COST, OF_FRAMES = 0.05, 0.75
+"""Undoing an unsharp mask that no phone applied may cost this fraction of the blur's squared error, in this fraction of
+the frames.  A frame is deblurred for a gain of 0.5 dB or more, which removes 11 % of that error.
+
+In 18 of 19 simulated captures the expected mask costs 0.1 to 2 %.  In the other, of gravel with paths of 1.6 to 4 px
+that no phone sharpened, it costs 50 %: undone in full, it takes 11 of 30 frames below straightening alone."""
 
 
 def with_neighbour_survey(
@@ -79,6 +87,9 @@ def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> t
     edges = overshoot(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
     if edges is None or (mask := edges.expected_mask()).amount <= RESIDUAL_AMOUNT:
         return plan, dict(sights)
+    mask = _without_great_cost(mask, sights)
+    if mask.amount <= RESIDUAL_AMOUNT:
+        return plan, dict(sights)
     seen = "edges overshoot as after" if edges.overshoots else "edges do not exclude"
     note = (
         f"{seen} a phone's sharpening: before deblurring, process undoes the expected unsharp mask, "
@@ -86,3 +97,18 @@ def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> t
     )
     plan = replace(plan, mask=mask, notes=(*plan.notes, note))
     return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}
+
+
+def _without_great_cost(mask: UnsharpMask, sights: Mapping[int, Sight]) -> UnsharpMask:
+    """The mask with as much of its amount as costs little compared with the blur, if the phone sharpened nothing.
+
+    The change by undoing it is proportional to its amount.
+    """
+    cost = []
+    for one in [*sights.values()][::2]:  # they come in runs of similar frames
+        if one.usable and one.motion is not None and one.motion.exposure_s > 0:
+            undone = without_mask(one.picture, mask)
+            change = cv2.norm(undone, one.picture, cv2.NORM_L2SQR) / undone.size
+            cost.append(change / max(blur_error(undone, one.motion, one.coding_step), 1e-6))
+    part = np.sqrt(MOST_COST / max(float(np.quantile(cost, OF_FRAMES)), MOST_COST)) if cost else 0.0
+    return replace(mask, amount=mask.amount * float(part))

@@ -19,6 +19,7 @@ from virest.restoration.neighbours.reduced_tiles import reduced
 from virest.restoration.neighbours.refinement import RefinedMotion
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.of_picture import SAMPLE_TILE_PX, measured_centres, picture_statistics
+from virest.restoration.statistics.records import PictureStatistics
 from virest.restoration.statistics.tile_power import FEW_TILES
 from virest.restoration.taken_part import blurred_part, no_gain_reason, trusted_share
 from virest.restoration.tile_layout import THIN_MARGIN
@@ -47,8 +48,7 @@ def try_restoration(
     if deblur_method(motion, settings, longest_px)[0] == "none":
         return None
     curve, field = motion.profile.curve, smooth_field(motion, ANCHOR)
-    measured_px = measured_centres(luma, motion, coding_step)
-    statistics = picture_statistics(luma, field(measured_px), curve, FEW_TILES, coding_step)
+    statistics = _few_statistics(luma, motion, coding_step)
     covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
     spread = kernel_spread(field, width, height, covariance_px2)
     model = statistics[0].with_kernel_variance(spread)
@@ -62,3 +62,17 @@ def try_restoration(
     if rows is not None:
         recorded, restored = recorded / rows, restored / rows
     return reduced(recorded), reduced(restored)
+
+
+def blur_error(luma: NDArray[np.uint8], motion: RowMotion, coding_step: float | None) -> float:
+    """Mean square error, grey levels squared, of a luma (height, width) by its blur; 0 where not measurable."""
+    measured = _few_statistics(luma, motion, coding_step)[0]
+    return measured.blur_error if measured.measured else 0.0
+
+
+def _few_statistics(
+    luma: NDArray[np.uint8], motion: RowMotion, coding_step: float | None
+) -> tuple[PictureStatistics, PictureStatistics]:
+    centres_px = measured_centres(luma, motion, coding_step)
+    kernels = smooth_field(motion, ANCHOR)(centres_px)
+    return picture_statistics(luma, kernels, motion.profile.curve, FEW_TILES, coding_step)
