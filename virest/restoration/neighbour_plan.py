@@ -106,7 +106,7 @@ def _without_great_cost(mask: UnsharpMask, sights: Mapping[int, Sight]) -> Unsha
     """
     cost = []
     for one in [*sights.values()][::2]:  # they come in runs of similar frames
-        if one.usable and one.motion is not None and one.motion.exposure_s > 0:
+        if one.usable and one.motion is not None:
             undone = without_mask(one.picture, mask)
             change = cv2.norm(undone, one.picture, cv2.NORM_L2SQR) / undone.size
             cost.append(change / max(blur_error(undone, one.motion, one.coding_step), 1e-6))
