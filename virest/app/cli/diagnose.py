@@ -29,10 +29,10 @@ def diagnose(
 
     \b
     $ virest diagnose trip
-    trip: 5661 tracks in 30 frames, residual 0.795 px (tracking noise 0.0946 px)
+    trip: 5641 tracks in 30 frames, residual 0.781 px (tracking noise 0.0912 px)
     cause              parameter  given   found          ±  before    after  gain ...
-    readout_time  readout_time_s  0.022  0.01493  4.209e-05  0.7985  0.1026  100% ...
-    readout_time: the readout takes 0.01493 s
+    readout_time  readout_time_s  0.022  0.0149  4.473e-05  0.7909  0.09802  100% ...
+    readout_time: the readout takes 0.0149 s
     ...
     wrote virest-out/trip/diagnosis.json, extended.yaml and figures
     verdict: explained
