@@ -569,17 +569,18 @@ def test_waves_in_dark_areas_shrink_to_the_mean_light() -> None:
 
 
 def test_the_less_the_expected_gain_the_less_of_the_change_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seven tenths of the change for a gain of 1 dB, and all of it for 3 dB; the log gives the weight."""
+    """Seven tenths of the change for a gain of 1 dB, two fifths if it is uncertain, all for 3 dB; the log says so."""
     turning = camera(reference="frame-middle")
     recorded = record(turning).picture
     settings = replace(BALANCED, shutter="none", reference="frame-middle")
     pictures, shares = [], []
-    for gain_db in (3.0, 1.0):
-        monkeypatch.setattr(ConfirmedGain, "of_change_db", lambda *_, gain_db=gain_db: (gain_db, 0.3))
+    for gain in ((3.0, 0.3), (1.0, 0.3), (1.0, 2.0)):
+        monkeypatch.setattr(ConfirmedGain, "of_change_db", lambda *_, gain=gain: gain)
         confirmed = ConfirmedGain(1.0, 0.2, 0.02, 4)
         result = restore_frame(FRAME, recorded, turning.motion, turning.trajectory, settings, confirmed=confirmed)
         pictures.append(_picture(result).astype(float))
         shares.append(result.parameters["deblur"]["share"])
-    assert shares == pytest.approx([1.0, 0.7])
-    np.testing.assert_allclose(pictures[1] - recorded, 0.7 * (pictures[0] - recorded), atol=1.0)
+    assert shares == pytest.approx([1.0, 0.7, 0.4])
+    for picture, share in zip(pictures, shares, strict=True):
+        np.testing.assert_allclose(picture - recorded, share * (pictures[0] - recorded), atol=1.0)
     assert np.abs(pictures[0] - recorded).mean() > 2

@@ -331,11 +331,11 @@ def _deblurred(
     restored = _blended(sharp, recorded, part)
     changed = 0.0 if confirmed is None else _mean_square(restored, recorded)
     details = _details(blur, settings, measured, joined, confirmed, changed)
-    if details.expected_gain_db is not None:
+    if details.expected_gain_db is not None and details.expected_gain_std_db is not None:
         why_not = no_gain_reason(measured.luma_model, details.expected_gain_db, LEAST_CONFIRMED_DB)
         if why_not:
             return as_shown, None, (why_not,)
-        share = gaining_share(details.expected_gain_db)
+        share = gaining_share(details.expected_gain_db, details.expected_gain_std_db)
         if blur.anchor == 0.5 and share < details.share:
             less = share_map(blurred, share / details.share)
             restored, details = _blended(restored.__getitem__, recorded, less), replace(details, share=share)
