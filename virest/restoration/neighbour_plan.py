@@ -20,7 +20,7 @@ from virest.restoration.capture import RestorationPlan, at_true_times, moved_ove
 from virest.restoration.neighbours.refinement import RefinedMotion, unmeasured_turn
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight
 from virest.restoration.neighbours.survey import path_length_px, survey_gain, survey_turns
-from virest.restoration.settings import PRESETS
+from virest.restoration.settings import PRESETS, RestorationSettings
 from virest.restoration.trial import blur_error, try_restoration
 
 MOST_COST, OF_FRAMES = 0.05, 0.75
@@ -87,7 +87,7 @@ def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> t
     edges = overshoot(sorted(usable, key=lambda one: path_length_px(one[1]))[:MOST_FRAMES])
     if edges is None or (mask := edges.expected_mask()).amount <= RESIDUAL_AMOUNT:
         return plan, dict(sights)
-    mask = _without_great_cost(mask, sights)
+    mask = _without_great_cost(mask, sights, plan.settings)
     if mask.amount <= RESIDUAL_AMOUNT:
         return plan, dict(sights)
     seen = "edges overshoot as after" if edges.overshoots else "edges do not exclude"
@@ -99,16 +99,17 @@ def _without_sharpening(plan: RestorationPlan, sights: Mapping[int, Sight]) -> t
     return plan, {n: replace(one, picture=without_mask(one.picture, mask)) for n, one in sights.items()}
 
 
-def _without_great_cost(mask: UnsharpMask, sights: Mapping[int, Sight]) -> UnsharpMask:
+def _without_great_cost(mask: UnsharpMask, sights: Mapping[int, Sight], settings: RestorationSettings) -> UnsharpMask:
     """The mask with as much of its amount as costs little compared with the blur, if the phone sharpened nothing.
 
-    The change by undoing it is proportional to its amount.
+    The change by undoing it is proportional to its amount.  Only frames that are deblurred count.
     """
     cost = []
     for one in [*sights.values()][::2]:  # they come in runs of similar frames
         if one.usable and one.motion is not None:
             undone = without_mask(one.picture, mask)
-            change = cv2.norm(undone, one.picture, cv2.NORM_L2SQR) / undone.size
-            cost.append(change / max(blur_error(undone, one.motion, one.coding_step), 1e-6))
+            lost = blur_error(undone, one.motion, settings, one.coding_step)
+            if lost is not None:
+                cost.append(cv2.norm(undone, one.picture, cv2.NORM_L2SQR) / undone.size / max(lost, 1e-6))
     part = np.sqrt(MOST_COST / max(float(np.quantile(cost, OF_FRAMES)), MOST_COST)) if cost else 0.0
     return replace(mask, amount=mask.amount * float(part))

@@ -42,9 +42,7 @@ def try_restoration(
     compared.
     """
     height, width = luma.shape
-    centres_px = tile_grid(height, width, SAMPLE_TILE_PX, 0).centres_px
-    longest_px = float(np.linalg.norm(blur_chords(motion, centres_px), axis=-1).max())
-    longest_px = float(equivalent_length_px(longest_px, most_defocus_px(motion.profile)))
+    longest_px = _longest_px(motion)
     if deblur_method(motion, settings, longest_px)[0] == "none":
         return None
     curve, field = motion.profile.curve, smooth_field(motion, ANCHOR)
@@ -64,10 +62,20 @@ def try_restoration(
     return reduced(recorded), reduced(restored)
 
 
-def blur_error(luma: NDArray[np.uint8], motion: RowMotion, coding_step: float | None) -> float:
-    """Mean square error, grey levels squared, of a luma (height, width) by its blur; 0 where not measurable."""
+def blur_error(
+    luma: NDArray[np.uint8], motion: RowMotion, settings: RestorationSettings, coding_step: float | None
+) -> float | None:
+    """Mean square error, grey levels squared, of a luma (height, width) by its blur; None: it is not deblurred."""
+    if deblur_method(motion, settings, _longest_px(motion))[0] == "none":
+        return None
     measured = _few_statistics(luma, motion, coding_step)[0]
-    return measured.blur_error if measured.measured else 0.0
+    return None if no_gain_reason(measured, measured.expected_gain_db) else measured.blur_error
+
+
+def _longest_px(motion: RowMotion) -> float:
+    centres_px = tile_grid(motion.profile.height, motion.profile.width, SAMPLE_TILE_PX, 0).centres_px
+    chord_px = float(np.linalg.norm(blur_chords(motion, centres_px), axis=-1).max())
+    return float(equivalent_length_px(chord_px, most_defocus_px(motion.profile)))
 
 
 def _few_statistics(
