@@ -29,7 +29,8 @@ the frames.  A frame is deblurred for a gain of 0.5 dB or more, which removes 11
 
 In 18 of 19 simulated captures the expected mask costs 0.1 to 2 %.  In the other, of gravel with paths of 1.6 to 4 px
 that no phone sharpened, it costs 50 %: undone in full, it takes 11 of 30 frames below straightening alone.  Of eight
-captures drawn later, all sharpened, four have less of it undone: one gains 0.5 dB more with ``balanced``, one 0.4 less."""
+captures drawn later, all sharpened, four have less of it undone: with ``balanced`` one gains 0.5 dB more, one 0.4 less.
+"""
 
 
 def with_neighbour_survey(
