@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import threading
 import time
 
 import pytest
@@ -55,6 +56,14 @@ def test_one_job_runs_in_this_process() -> None:
     """Without a second core no process is started."""
     with process_map(1) as each:
         assert each(os.getpid, [(), ()]) == [os.getpid()] * 2
+
+
+def test_no_thread_of_the_pool_is_left_for_the_exit() -> None:
+    """A call in progress ends first: at Python's exit its thread and Python would close the same pipe."""
+    before = set(threading.enumerate())
+    with process_map(2) as each:
+        begun(each, time.sleep, 0.5)
+    assert set(threading.enumerate()) <= before
 
 
 def test_an_interruption_waits_for_no_worker() -> None:

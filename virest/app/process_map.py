@@ -88,9 +88,13 @@ class _ProcessPool:
         return submit_uninterrupted(self._pool, function, *parts)
 
     def close(self) -> None:
-        """Shut the processes down; calls not yet started are cancelled."""
+        """Shut the processes down, once the calls in progress have ended; calls not yet started are cancelled.
+
+        Waiting costs nothing, since Python waits for them at its exit at the latest.  There its own clean-up and the
+        pool's manager thread may close the same pipe, and a traceback follows the command's result.
+        """
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool.shutdown(wait=True, cancel_futures=True)
 
     def kill(self) -> None:
         """Kill the processes without waiting for their calls."""
