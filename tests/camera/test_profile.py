@@ -240,7 +240,6 @@ def test_null_is_unknown() -> None:
         "shutter:",
         "shutter: {readout_direction: null, timestamp: null, exposure_scale: null}",
         "imu:",
-        "imu: {clock_skew: null, gyro_bias_rad_s: null, gyro_scale: null}",
         "sensor:",
         "scene:",
         "extensions: {focal_drift: null, stabilisation: {fraction: null}, response_gamma: null, gain: null}",
@@ -249,6 +248,20 @@ def test_null_is_unknown() -> None:
 def test_a_null_that_cannot_be_estimated_gives_the_default(text: str) -> None:
     """A null block or value equals one that is left out."""
     assert _parse(text + "\n") == _parse("")
+
+
+def test_nulls_of_the_gyroscope_are_open_until_they_are_estimated() -> None:
+    """They hold their defaults, are written as null, and are known once they have an estimate."""
+    text = "imu: {clock_skew: null, gyro_bias_rad_s: null}\n"
+    profile = _parse(text)
+    assert replace(profile, open_imu=()) == _parse("")
+    assert profile.open_imu == ("clock_skew", "gyro_bias_rad_s")
+    written = profile_mapping(profile)["imu"]
+    assert [written[key] for key in ("clock_skew", "gyro_bias_rad_s", "gyro_scale")] == [None, None, [1.0] * 3]
+    assert parse_profile(profile_mapping(profile)) == profile
+    found = profile.with_estimate("clock_skew", 1e-4, 1e-5, "points", clock_skew=1e-4)
+    assert found.open_imu == ("gyro_bias_rad_s",)
+    assert profile_mapping(found)["imu"]["clock_skew"] == 1e-4
 
 
 @pytest.mark.parametrize("text", ["scene: {dept_m: null}", "extensions: {gain: [1.0, null]}", "response: {kind: null}"])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field, cardinal_weights
 from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import parse_profile, profile_mapping
 from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import focus_log
 from virest.diagnosis.ambiguities import merged
@@ -696,6 +697,29 @@ def test_a_wandering_clock_is_a_delay_over_time() -> None:
     off = profile.imu_time_s(stamps) - phone.profile.imu_time_s(stamps) - late(stamps)
     line = np.polyval(np.polyfit(stamps, off, 1), stamps)
     assert np.std(off - line) < 5e-4
+
+
+def test_stamps_that_jitter_are_named_and_each_frame_gets_its_time(rng: np.random.Generator) -> None:
+    """A frame's delay says nothing about the next one's; the points give each frame its own."""
+    jitter_s = rng.normal(0.0, 0.0015, HAND.frames)
+    setup = replace(HAND, seed=93)
+    stamps = StrangePhone(setup, Strange()).stamp_s
+    phone = WanderingPhone(setup, lambda stamp_s: np.interp(stamp_s, stamps, jitter_s))
+    verdict, (field,) = judged(phone, phone.profile)
+    assert "the frames' stamps jitter" in field.sentence
+    assert field.size == pytest.approx(np.std(jitter_s), abs=3 * field.std)
+    assert gained(field) > 0.8
+    off = verdict.model.profile.imu_time_s(stamps) - phone.profile.imu_time_s(stamps) - jitter_s
+    assert np.std(off[1:]) < 1e-4  # no pair shows the first frame
+    assert parse_profile(profile_mapping(verdict.model.profile)).fields == verdict.model.profile.fields
+
+
+@pytest.mark.parametrize("seed", [94, 95])
+def test_a_noisy_gyroscope_delays_no_frames(seed: int) -> None:
+    """It turns frames about all axes; delays remove only the part along the motion."""
+    phone = StrangePhone(replace(HAND, seed=seed, gyro_noise_rad_s=0.03), Strange())
+    _, fields = judged(phone, phone.profile)
+    assert fields == []
 
 
 def test_a_hunting_focus_is_a_scale_over_time() -> None:

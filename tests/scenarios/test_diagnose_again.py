@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from virest.app.diagnose import extended_text, open_source
@@ -77,3 +78,19 @@ def test_a_fitted_unknown_readout_is_written(work: Path) -> None:
         ("time_offset_s", profile.time_offset_s, 0.0),
     ):
         assert abs(value - truth) < 4 * profile.estimates[name].std
+
+
+def test_an_open_bias_is_fitted_and_no_cause(work: Path) -> None:
+    """A profile that gives it as null does not err; one that gives 0 does."""
+    source = open_source(_capture(work / "open_bias", ["gyro_bias=0.02,-0.01,0.015"], 519))
+    given = [source.profile, replace(source.profile, open_imu=("gyro_bias_rad_s",))]
+    stated, still_open = (diagnose_capture(source.capture, one, source.pictures, source.gray) for one in given)
+    assert [cause.name for cause in stated.causes] == ["gyro_bias"]
+    assert still_open.verdict == CONSISTENT
+    assert not still_open.causes
+    extended = work / "bias.yaml"
+    extended.write_text(extended_text("bias", still_open), encoding="utf-8")
+    profile = read_profile(extended)
+    assert profile.open_imu == ()
+    off = np.subtract(profile.gyro_bias_rad_s, (0.02, -0.01, 0.015))
+    assert np.all(np.abs(off) < 4 * np.array(profile.estimates["gyro_bias_rad_s"].std))

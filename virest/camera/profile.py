@@ -25,6 +25,8 @@ ANDROID_R_CAM_IMU = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """Rotation from the device axes to the stored portrait picture of an Android phone's rear camera."""
 LANDSCAPE_R_CAM_IMU = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 """The same for a stored landscape picture, whose rows are those of the sensor."""
+OPEN_IMU = {"clock_skew": 0.0, "gyro_bias_rad_s": (0.0, 0.0, 0.0), "gyro_scale": (1.0, 1.0, 1.0)}
+"""Values of the imu block that have a default and that tracked points determine, with that default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +86,8 @@ class CameraProfile:
     gyro_bias_rad_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gyro_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """measured = scale x true + bias."""
+    open_imu: tuple[str, ...] = ()
+    """Those of OPEN_IMU that the profile gives as ``null``: they hold the default, and ``diagnose`` fits them."""
     response: ResponseCurve | None = None
     """None: unknown; sRGB is then used, with a warning. Holds the extensions response_gamma and black_level."""
     sensor_width_mm: float | None = None
@@ -205,7 +209,9 @@ class CameraProfile:
 
     def with_estimate(self, name: str, value: Any, std: Any, source: str, **changes: Any) -> CameraProfile:
         """The profile with changes, recorded as an estimate with its source."""
-        return replace(self, estimates={**self.estimates, name: Estimate(value, std, source)}, **changes)
+        estimates = {**self.estimates, name: Estimate(value, std, source)}
+        still_open = tuple(key for key in self.open_imu if key != name)
+        return replace(self, estimates=estimates, open_imu=still_open, **changes)
 
     def with_focal(self, focal_px: float, std_px: float, source: str) -> CameraProfile:
         """The profile with an estimated focal length and square pixels."""

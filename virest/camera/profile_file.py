@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from pydantic import ValidationError
 from virest.arrays import Array
 from virest.camera.field import Field as ModelField
 from virest.camera.intrinsics import COEFFICIENT_NAMES, Intrinsics
-from virest.camera.profile import ANDROID_R_CAM_IMU, CameraProfile, Estimate, Extensions
+from virest.camera.profile import ANDROID_R_CAM_IMU, OPEN_IMU, CameraProfile, Estimate, Extensions
 from virest.camera.profile_schema import ExtensionsBlock, FieldBlock, ProfileFile, ResponseBlock
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import Shutter
@@ -36,7 +37,8 @@ def parse_profile(content: dict[str, Any], name: str = "profile") -> CameraProfi
     except ValidationError as error:
         raise explain_validation(error, ProfileFile, name) from None
     try:
-        return _from_model(model)
+        imu = content.get("imu") or {}
+        return replace(_from_model(model), open_imu=tuple(key for key in OPEN_IMU if imu.get(key, ...) is None))
     except SettingsError as error:
         raise SettingsError(f"{name}: {error.message}", hint=error.hint) from None
 
@@ -262,9 +264,7 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         "imu": {
             "T_cam_imu": profile.pose_cam_imu.tolist(),
             "time_offset_s": profile.time_offset_s,
-            "clock_skew": profile.clock_skew,
-            "gyro_bias_rad_s": list(profile.gyro_bias_rad_s),
-            "gyro_scale": list(profile.gyro_scale),
+            **{name: _or_null(profile, name) for name in OPEN_IMU},
         },
         "response": response_block(profile.response) if profile.response else None,
         "sensor": {
@@ -277,6 +277,14 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         "extensions": extensions,
         **stretches,
     }
+
+
+def _or_null(profile: CameraProfile, name: str) -> Any:
+    """A value of OPEN_IMU; None: it is open, and holds its default."""
+    value = getattr(profile, name)
+    if name in profile.open_imu and value == OPEN_IMU[name]:
+        return None
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _field_block(entry: ModelField) -> dict[str, Any]:

@@ -171,7 +171,7 @@ class FieldBlock(_Strict):
     version: Literal[1, 2] = 1
     kind: Literal["delay", "displacement", "scale", "rate", "gain", "blur"]
     covariates: Annotated[list[str], Field(min_length=1, max_length=2)]
-    knots: Annotated[list[Annotated[list[Number], Field(max_length=200)]], Field(min_length=1, max_length=2)]
+    knots: Annotated[list[Annotated[list[Number], Field(max_length=500)]], Field(min_length=1, max_length=2)]
     values: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)]
     std: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)] = []
     stamp_0_ns: int | None = None

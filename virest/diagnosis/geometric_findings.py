@@ -45,12 +45,13 @@ def with_unknowns_of(verdict: GeometricVerdict, profile: CameraProfile) -> Camer
         if value is None or term.name not in verdict.fit.slices:
             continue
         floor = bias_std(verdict.fit, term.name, verdict.step_noise_px)
-        std = float(np.hypot(verdict.fit.std(term.name), floor)[0])
+        std = np.hypot(verdict.fit.std(term.name), floor)
         found = value.read(replace(profile, readout_known=True))
-        if std < value.max_std and isinstance(found, float):
+        if std.max() < value.max_std and found is not None:
             known = profile.readout_known or term.name == "readout_time"
-            std *= found if value.is_factor else 1.0
-            profile = profile.with_estimate(value.name, found, std, UNKNOWN_FITTED, readout_known=known)
+            std = std * (np.abs(found) if value.is_factor else 1.0)
+            std_of = std.tolist() if isinstance(found, list) else float(std[0])
+            profile = profile.with_estimate(value.name, found, std_of, UNKNOWN_FITTED, readout_known=known)
     return profile
 
 

@@ -20,6 +20,8 @@ from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.picture_ladder import Reader
+from virest.effects.records import Effect
+from virest.effects.table import EFFECTS
 from virest.image_formation.light import flicker
 from virest.image_formation.row_clock import RowClock
 from virest.inference import profile_terms as terms_of
@@ -215,6 +217,8 @@ def with_null_values(
         )
     if not profile.readout_known and informative:
         terms.append(terms_of.READOUT if profile.time_offset_s is None else PLAIN_READOUT)
+    if informative:
+        terms += [terms_of.TERMS[name] for name, effect in EFFECTS.items() if _is_open(effect, profile)]
     if profile.time_offset_s is not None:
         return profile, terms, notes, far or FarStart(), agree
     if far is None:
@@ -223,6 +227,10 @@ def with_null_values(
     terms += [terms_of.TIME_OFFSET] if informative else []
     aligned = replace(profile, time_offset_s=far.offset_s)
     return aligned, terms, notes, FarStart(0.0, far.skewed_offset_s - far.offset_s, far.skew, far.axes), agree
+
+
+def _is_open(effect: Effect, profile: CameraProfile) -> bool:
+    return effect.calibrated is not None and effect.calibrated.name in profile.open_imu
 
 
 def at_rest(observed: ObservedTracks, profile: CameraProfile) -> bool:

@@ -43,6 +43,8 @@ FINE_RATE_QUANTILE = 0.97
 """Fine knots over a rate cover this quantile of the readings; too few rows lie beyond."""
 SINH_SPACING = 3.0
 """Fine knots over a rate are spaced by sinh: 1/20 of the range apart near rest, where a hand is most of the time."""
+MOST_FRAMES = 450
+"""Frames whose stamps may each be late by their own time: those of a capture that is tracked in every frame."""
 FRAMES_PER_STEP, MOST_STEPS = 2, 100
 """Frames between the instants at which a sudden change is searched for, and the maximum number of instants."""
 LEAST_REACH_RAD_S = 0.1
@@ -69,6 +71,8 @@ def possible_forms(
     drifts += [_drift_form("delay", stamps, stamp, known), _drift_form("scale", fine, stamp, known, local=True)]
     drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
     drifts.append(_drift_form("rate", knots[[0, -1]], stamp, known))
+    if len(starts := _frame_starts_s(capture, profile, span_s)) <= MOST_FRAMES:
+        drifts.append(_late_frames_form(starts, stamp, known))
     places = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), _off_centre_form(profile)]
     forms = [*places, *drifts]
     forms += step_forms(capture, candidate_steps_s(span_s, capture))
@@ -246,6 +250,23 @@ def _drift_form(
     more = np.linspace(knots[0], knots[-1], 2 * count - 1)
     refine = again(more) if len(more) <= (MOST_RATE_KNOTS if kind == "rate" else MOST_KNOTS) else None
     return FieldForm((field,), free, local=local, build=again(knots), refine=refine)
+
+
+def _frame_starts_s(capture: Capture, profile: CameraProfile, span_s: tuple[float, float]) -> Array:
+    """Starts of the first row of the frames in a span of IMU time and next to it, camera clock."""
+    frames = [(frame.time_s, frame.exposure_s or 0.0) for frame in capture.frames]
+    starts = np.unique(_rounded(np.array([profile.shutter.first_row_start_s(*frame) for frame in frames])))
+    begin_s, end_s = (float(profile.camera_time_s(t)) for t in span_s)
+    period_s = float(np.median(np.diff(starts)))
+    return starts[(starts > begin_s - period_s) & (starts < end_s + period_s)]
+
+
+def _late_frames_form(starts_s: Array, stamp_0_ns: int, known: frozenset[str]) -> FieldForm:
+    """A delay of its own for each frame: stamps that jitter."""
+    made = _drift_form("delay", starts_s, stamp_0_ns, known, local=True)
+    return replace(
+        made, build=lambda _profile, now: _late_frames_form(starts_s, stamp_0_ns, now), refine=None, by_frame=True
+    )
 
 
 def step_forms(capture: Capture, at_s: Array, kind: str = "scale") -> list[FieldForm]:

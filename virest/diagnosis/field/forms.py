@@ -45,6 +45,8 @@ class FieldForm:
     """Builds the form for another profile and other terms in the model; None: it depends on neither."""
     refine: Recipe | None = None
     """Builds the same with more knots; None: the maximum is reached."""
+    by_frame: bool = False
+    """Whether it has a knot at the start of each frame, so that no frame says anything about another."""
 
     @property
     def kind(self) -> str:
@@ -150,8 +152,27 @@ class FieldForm:
         """The form as a term of the fit of tracked points."""
         count = self.basis.shape[1]
         step, std = QUOTIENT[self.kind], STD[self.kind]
-        slopes = self._displaced if self.kind == "displacement" else None
+        slopes = self._displaced if self.kind == "displacement" else self._late_frames if self.by_frame else None
         return Term(self.name, self.change, (step,) * count, (std,) * count, (std,) * count, slopes)
+
+    def _late_frames(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> Array:
+        """Slopes (n, 2, k) of a delay of each frame: a point moves with the delays of its two frames alone.
+
+        Frames of one colour are delayed at once; no pair has both of its frames in one colour.
+        """
+        knots = np.array(self.fields[0].knots[0])
+        ends = [np.argmin(np.abs(knots - s[:, None]), axis=1) for s in (table.first_stamp_s, table.second_stamp_s)]
+        colours = int(np.abs(ends[1] - ends[0]).max()) + 1
+        field, step = self.held_in(profile, self.fields[0]), QUOTIENT[self.kind]
+        others = [f for f in profile.fields if not _adds_to(field, f)]
+        per_value = np.zeros((len(table), 2, len(knots)))
+        for colour in range(colours):
+            late = np.array(field.values) + step * (np.arange(len(knots)) % colours == colour)[:, None]
+            moved = moved_by(profile.with_fields([*others, field.with_values(late)])) / step
+            for end in ends:
+                rows = np.flatnonzero(end % colours == colour)
+                per_value[rows, :, end[rows]] = moved[rows]
+        return np.asarray(per_value @ self.basis)
 
     def _displaced(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> Array:
         """Slopes (n, 2, k) of a displacement u: u(p₂) − J u(p₁); J follows from shifting both points equally."""

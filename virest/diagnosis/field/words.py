@@ -27,6 +27,8 @@ JUMP_WIDTH = 0.1
 """As a fraction of half the range: a spline with 40 knots cannot jump faster."""
 MIN_EXPLAINED_OVER_FRAME = 0.9
 """The same for a displacement over the frame."""
+MIN_JITTER, JITTER = 0.5, "jitter"
+"""Half of what independent values have, and the shape's name."""
 OFF_CENTRE, LINEAR, RADIAL = "growing with its square", "linear", "radial"
 SAMPLES = 101
 """Steps of 1 % of the range."""
@@ -54,6 +56,11 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
     ("delay", ("time",)): Pattern(
         "frames are {lateness} by up to {size} {where} of the capture, {shape} of time: the stamps' clock wanders",
         "stamps that are taken in software, a queue that fills, or a clock that is corrected while it runs",
+        "film a display that counts milliseconds, and compare the steps of the stamps with the steps shown",
+    ),
+    ("delay", ("frame",)): Pattern(
+        "the frames' stamps jitter: from frame to frame they are off by {size} (rms)",
+        "stamps that are taken in software when a frame arrives, not by the sensor, or that were rounded or averaged",
         "film a display that counts milliseconds, and compare the steps of the stamps with the steps shown",
     ),
     ("displacement", ("x", "y")): Pattern(
@@ -128,6 +135,9 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     shape = shape_of(fields[0]) if len(fields) == 1 else _common_shape(fields)
     size, std = _size(fields)
     pattern = PATTERNS[form.kind, form.covariates]
+    if form.by_frame and is_jitter(late_s := np.array(fields[0].values)[:, 0]):
+        shape, pattern = JITTER, PATTERNS[form.kind, ("frame",)]
+        size, std = _rms_of(late_s, np.array(fields[0].std)[:, 0])
     factor, unit = UNIT_SCALES[form.kind]
     amount = f"{size * factor:.3g} {unit}"
     sentence = pattern.sentence.format(
@@ -215,6 +225,22 @@ def _distrusted(entry: Distrusted) -> FieldFinding:
         bridges,
         tuple((s.from_s, s.to_s) for s in entry.stretches),
     )
+
+
+def is_jitter(values: Array) -> bool:
+    """Whether successive values (n,) are about as different as any two.
+
+    Half the mean square of their steps over their variance (von Neumann 1941, doi:10.1214/aoms/1177731677) is 1 for
+    independent values and near 0 for a curve.
+    """
+    return float(np.mean(np.diff(values) ** 2)) > MIN_JITTER * 2 * float(np.var(values))
+
+
+def _rms_of(values: Array, std: Array) -> tuple[float, float]:
+    """Rms of those of values (n,) that are determined, less what their deviations (n,) add, and its own deviation."""
+    known = std < np.std(values)
+    rms = np.sqrt(max(float(np.var(values[known]) - np.mean(std[known] ** 2)), 0.0))
+    return float(rms), float(rms / np.sqrt(2 * np.count_nonzero(known)))
 
 
 def shape_of(field: Field) -> str:
