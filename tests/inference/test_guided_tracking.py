@@ -138,6 +138,13 @@ def test_a_shaken_chessboard_is_restored(board: Recording) -> None:
 # ── limits ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_log_in_degrees_gives_no_guide(board: Recording) -> None:
+    """Predicted points turn behind the camera."""
+    strange = board.with_log(180 / np.pi * board.capture.imu.gyro_rad_s)
+    assert find_guide(strange.capture, board.phone.profile, board.gray, board.frames) is None
+
+
 def test_an_unrelated_log_gives_no_guide(board: Recording, wall: Recording) -> None:
     """Reversed, shuffled or cut logs, and those of other recordings, give no guide for any content."""
     for recording in (board, wall):

@@ -12,6 +12,7 @@ import pytest
 from motion.synthetic_motion import R_CAM_IMU, Setup, Synthetic, hand_motion, make, observed_pairs
 from motion.synthetic_tracks import Setup as Hand
 from motion.synthetic_tracks import recorded as hand
+from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.profile_file import read_profile
@@ -74,6 +75,26 @@ def test_a_gyroscope_with_other_axes_is_reported() -> None:
     assert not told.agrees
     assert "virest calibrate finds them" in told.reason
     assert not estimate(Setup(hand_motion(3), frames=30, points=60)).other_axes
+
+
+@pytest.mark.parametrize(
+    ("logged", "words"),
+    [
+        (np.diag([180 / np.pi] * 3), "read as degrees per second it"),
+        (-np.eye(3), "with its sign reversed it"),
+        (-np.diag([180 / np.pi] * 3), "read as degrees per second with its sign reversed it"),
+        (np.diag([1.0, 1.0, -1.0]), "with one axis reversed, or two swapped, it"),
+        (np.eye(3)[[2, 1, 0]], "with one axis reversed, or two swapped, it"),
+    ],
+)
+def test_a_log_in_another_unit_or_sign_is_recognised(logged: NDArray[np.float64], words: str) -> None:
+    """The gyroscope explains nothing as logged; how it must be read is said."""
+    recorded = make(Setup(hand_motion(3), time_offset_s=0.011, frames=30, points=60))
+    profile = replace(recorded.profile, time_offset_s=0.011)
+    imu = replace(recorded.imu, gyro_rad_s=recorded.imu.gyro_rad_s @ logged.T)
+    told = check_agreement(recorded.observed(profile), imu, profile)
+    assert not told.agrees
+    assert f"{words} would explain" in told.reason
 
 
 @pytest.mark.parametrize("error_s", [0.007, -0.012])

@@ -151,6 +151,15 @@ def test_a_still_camera_is_copied() -> None:
     assert (result.parameters["deblur"]["method"], result.parameters["shutter"]["method"]) == ("none", "none")
 
 
+def test_a_blur_longer_than_the_picture_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A log in degrees predicts such blurs: nothing is measured on them."""
+    monkeypatch.setattr("virest.restoration.frame.picture_statistics", None)
+    turning = camera((20.0, -60.0, 0.0), 0.02)
+    result = _restore(turning, record(camera()).picture, replace(BALANCED, shutter="none"))
+    assert result.parameters["deblur"]["method"] == "none"
+    assert any("longer than the picture" in warning for warning in result.warnings)
+
+
 def test_without_an_exposure_time_a_frame_is_only_straightened() -> None:
     """An unknown exposure prevents deblurring but not straightening, and the log says so."""
     turning = camera((0.5, -1.1, 0.4), 0.02)

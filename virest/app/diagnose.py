@@ -358,6 +358,9 @@ def _pictures_figure(
 def simulated_frame(capture: Capture, profile: CameraProfile, number: int) -> Picture | None:
     """Frame ``number`` as simulated from the restored next frame; None if that fails."""
     plan = RestorationPlan(profile, PRESETS["balanced"], imu_gaps_s=capture.imu_gaps_s)
+    if _blur_px(capture, profile, number) >= min(capture.width, capture.height):
+        log.info("%s: frame %d was not simulated: its blur would be longer than the picture", capture.name, number)
+        return None
     try:
         scene = restored_scene(capture, plan, number + 1)
         if scene is None:
@@ -368,6 +371,17 @@ def simulated_frame(capture: Capture, profile: CameraProfile, number: int) -> Pi
         log.info("%s: frame %d could not be simulated: %s", capture.name, number, error)
         return None
     return render_picture(session, 0)
+
+
+def _blur_px(capture: Capture, profile: CameraProfile, number: int) -> float:
+    """Length of a frame's blur at the highest rate in its exposure, by the gyroscope; 0 without a focal length."""
+    frame = capture.frames[number]
+    begin_s, exposure_s = float(profile.imu_time_s(frame.time_s)), frame.exposure_s or 0.0
+    during = capture.imu.between(begin_s, begin_s + profile.shutter.readout_time_s + exposure_s)
+    if profile.intrinsics is None or not len(during):
+        return 0.0
+    rate_rad_s = np.linalg.norm(profile.true_rate_rad_s(during.gyro_rad_s), axis=1)
+    return float(rate_rad_s.max()) * exposure_s * profile.intrinsics.fx_px
 
 
 # ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────

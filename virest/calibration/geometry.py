@@ -48,7 +48,7 @@ from virest.inference.even_blur import even_guide, is_blurred
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
-from virest.inference.synchronisation import DRIFT_P
+from virest.inference.synchronisation import DRIFT_P, other_reading
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import Guide, TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
@@ -264,7 +264,7 @@ def _started(
         coarse, skew = _aligned(observed, imu, profile, "clock-skew" in names)
         doubt = coarse.doubt(len(observed.pairs), observed.lens.fx_px)
     if doubt is not None:
-        raise CalibrationError(doubt[0], hint=doubt[1])
+        raise CalibrationError(doubt[0], hint=other_reading(observed, imu, profile) or doubt[1])
     axes = tuple(map(tuple, coarse.rotation_cam_imu.tolist()))
     start = replace(profile, time_offset_s=coarse.time_offset_s, r_cam_imu=axes, clock_skew=skew)
     return observed, coarse, replace(start, intrinsics=observed.lens)

@@ -53,6 +53,7 @@ from virest.inference.guide_choice import find_guide, track_guided
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.parallel import Background, ParallelMap, begun, one_by_one
 from virest.inference.recorder_lag import lag_schedules
+from virest.inference.synchronisation import other_reading
 from virest.inference.tracking import track_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.scene_motion import InertialMotion
@@ -128,6 +129,8 @@ def _tracked(
         notes.append("the camera is at rest: clocks, readout and lens cannot be estimated from the points")
     elif not rungs_allowed:
         notes.append("the frames do not follow the gyroscope at any offset: no cause was fitted to the points")
+    if (not follows or far.axes) and (reading := other_reading(observed, capture.imu, start)):
+        notes.append(f"the gyroscope may be logged in another unit or sign: {reading}")
     return TrackedPoints(capture, observed, start, tuple(null_terms), schedules, far, rungs_allowed, each), notes
 
 

@@ -130,8 +130,8 @@ class _Scores:
     def at(self, shift_px: Array) -> Array:
         """Mean over tiles (..., p) at shifts (..., p, tiles, 2) in stored pixels."""
         side = self.values.shape[-1]
-        place = np.rint(shift_px / self.scale).astype(np.int32) + (side - 1) // 2
-        place = np.clip(place, 0, side - 1)
+        place = np.rint(shift_px / self.scale) + (side - 1) // 2  # nan: behind the camera
+        place = np.clip(np.nan_to_num(place, nan=0.0), 0, side - 1).astype(np.int32)
         surface = np.arange(self.values.shape[0] * self.values.shape[1]).reshape(self.values.shape[:2])
         flat = (surface * side + place[..., 1]) * side + place[..., 0]
         return np.asarray(self.values.ravel()[flat].mean(axis=-1))

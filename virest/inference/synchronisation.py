@@ -51,6 +51,13 @@ NEAR_S = 0.01
 """What the gyroscope explains at a fitted offset is read within this of it: 2.5 steps of the search."""
 FOREIGN_BIAS = 4.0
 """A bias further from the profile's than this many prior σ absorbs an unmodelled scene, lens or axis map."""
+READINGS = (
+    (np.pi / 180, True, "read as degrees per second"),
+    (-1.0, True, "with its sign reversed"),
+    (-np.pi / 180, True, "read as degrees per second with its sign reversed"),
+    (-1.0, False, "with one axis reversed, or two swapped,"),
+)
+"""Factor on the gyroscope's log that undoes a recorder's mistake, and whether the axes are then the profile's."""
 AGREEMENT_SLACK_S = 0.03
 """Smaller errors of the offset are left to calibration; they do not mean that frames and gyroscope disagree."""
 CLEARLY_BETTER = 30.0
@@ -255,7 +262,7 @@ def check_agreement(observed: ObservedTracks, imu: ImuSamples, profile: CameraPr
     if elsewhere is not None:
         hint = f"at an offset of {elsewhere:+.3f} s it would explain {coarse.explained:.0%}"
     else:
-        hint = _with_other_axes(observed, imu, profile, SEARCH_S)
+        hint = _with_other_axes(observed, imu, profile, SEARCH_S) or other_reading(observed, imu, profile)
         hint = hint or "was the movie stabilised in the camera, or is it from another recording?"
     reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the frames' rotation: {hint}"
     return Agreement(False, reason, explained=explained, best_offset_s=elsewhere)
@@ -267,6 +274,16 @@ def _with_other_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraP
     if coarse is None or not coarse.axes_changed or coarse.doubt(len(observed.pairs), observed.lens.fx_px):
         return ""
     return f"with other axes than the profile's it would explain {coarse.explained:.0%}: virest calibrate finds them"
+
+
+def other_reading(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> str:
+    """What the gyroscope explains if its log has another unit or sign, and what to do; empty: not enough either."""
+    for factor, own_axes, words in READINGS:
+        read = replace(imu, gyro_rad_s=factor * imu.gyro_rad_s)
+        coarse = align_coarsely(observed.turns(profile), read, profile, own_axes=own_axes)
+        if coarse is not None and not coarse.doubt(len(observed.pairs), observed.lens.fx_px):
+            return f"{words} it would explain {coarse.explained:.0%}: correct gyro_accel.csv"
+    return ""
 
 
 def _clearly_better(tried_s: Array, explained_at: Array, offset_s: float, figures: int) -> float | None:

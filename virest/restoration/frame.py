@@ -251,6 +251,8 @@ def deblur_method(motion: RowMotion, settings: RestorationSettings, longest_px: 
         return "none", ("exposure time unknown: not deblurred",)
     if longest_px < settings.min_blur_px:
         return "none", (f"blur of {longest_px:.2f} px is below {settings.min_blur_px:g} px: not deblurred",)
+    if longest_px >= min(motion.profile.width, motion.profile.height):  # most of its light is from outside
+        return "none", (f"blur of {longest_px:.0f} px is longer than the picture: not deblurred",)
     return settings.deblur, ()
 
 
