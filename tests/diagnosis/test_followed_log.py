@@ -9,9 +9,11 @@ import pytest
 from diagnosis.test_photometry import FRAMES, NOMINAL, dimmed, hidden, made_observations
 from numpy.typing import NDArray
 
+from virest.camera.field import Field
+from virest.camera.shutter import Shutter
 from virest.capture.records import Frame
-from virest.diagnosis.findings import Finding
-from virest.diagnosis.followed_log import with_followed_log
+from virest.diagnosis.findings import GEOMETRY, FieldFinding, Finding, HeldOutGain
+from virest.diagnosis.followed_log import with_followed_log, with_late_exposures
 from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.picture_ladder import PictureVerdict, climb_observations
 
@@ -81,3 +83,31 @@ def test_independent_gains_have_no_rival(rng: np.random.Generator) -> None:
     dimming = told(seen(STEPS - 0.4 * np.arange(FRAMES) / FRAMES, STEPS, rng), frames_of(STEPS))
     assert (dimming.name, dimming.rivals) == ("gain_drift", ())
     assert dimming.sentence.endswith("the gains follow time, a straight line")
+
+
+@pytest.mark.parametrize(
+    ("rows", "size", "timestamp", "named"),
+    [
+        (2, 1.0, "exposure_start", "2 frames late"),
+        (-1, 1.0, "exposure_start", "1 frame early"),
+        (1, 1.0, "exposure_end", "1 frame late"),
+        (1, 1.0, "exposure_middle", None),
+        (2, 2.0, "exposure_start", None),
+    ],
+)
+def test_delays_of_the_mid_exposures_have_the_exposure_table_as_rival(
+    rows: int, size: float, timestamp: str, named: str | None, rng: np.random.Generator
+) -> None:
+    """Half of the difference of the exposures, and neither twice that nor anything where stamps mark the middle."""
+    exposure_s = 0.01 + 0.005 * rng.random(60)
+    frames = [Frame(k, 0, k / 30, float(e)) for k, e in enumerate(exposure_s)]
+    shutter = Shutter(0.02, timestamp=timestamp)
+    start_s = np.array([shutter.first_row_start_s(frame.time_s, frame.exposure_s) for frame in frames])
+    other_s = exposure_s[np.clip(np.arange(60) + rows, 0, 59)] - exposure_s
+    late_s = size * (-0.5 if timestamp == "exposure_end" else 0.5) * other_s + rng.normal(0, 1e-5, 60)
+    late = Field("delay", ("time",), (tuple(start_s.tolist()),), tuple((float(v),) for v in late_s), (), 0)
+    gain = HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1)
+    found = FieldFinding(("time",), "delay", "jitter", "late", 0.002, "s", None, gain, 1e-9, (), 1.0, "", "", (late,))
+    told = with_late_exposures(found, frames, shutter)
+    assert told.confounded == (() if named is None else (f"exposure times logged {named}",))
+    assert (told == found) is (named is None)

@@ -18,11 +18,12 @@ from scipy.linalg import null_space
 from virest.arrays import Array, Index
 from virest.camera.field import cardinal_weights
 from virest.camera.profile import CameraProfile
+from virest.camera.shutter import STAMP_FRACTION, Shutter
 from virest.capture.records import Frame
 from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION
 from virest.diagnosis.field.words import SAMPLES, curve_shape
-from virest.diagnosis.findings import Finding, HeldOutGain, Rival
+from virest.diagnosis.findings import FieldFinding, Finding, HeldOutGain, Rival
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import FollowedGain
 from virest.diagnosis.photometry_fit import fit_photometry, judge
@@ -63,9 +64,7 @@ class Form:
     def rival(self) -> str:
         """Its name among the rivals."""
         if self.frames_off:
-            return f"exposure and ISO logged {abs(self.frames_off)} frame{'s' * (abs(self.frames_off) > 1)} " + (
-                "late" if self.frames_off > 0 else "early"
-            )
+            return f"exposure and ISO logged {_apart(self.frames_off)}"
         return f"gain over {LOGGED[self.name]}"
 
 
@@ -76,6 +75,39 @@ class _Followed:
     form: Form
     shape: str
     held_out: HeldOutGain
+
+
+def _apart(frames_off: int) -> str:
+    count, way = abs(frames_off), "late" if frames_off > 0 else "early"
+    return f"{count} frame{'s' * (count > 1)} {way}"
+
+
+def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], shutter: Shutter) -> FieldFinding:
+    """A delay of frames, with the exposures of other frames as rival if their mid-exposures are delayed like that.
+
+    frames: all of the movie, by index.  With the exposure of the frame that is N rows away, mid-exposures move by
+    half of the difference if a timestamp marks the exposure's start.
+    """
+    if (finding.kind, finding.covariates) != ("delay", (TIME,)):
+        return finding
+    (late,) = finding.fields
+    exposure_s = np.array([frame.exposure_s or np.nan for frame in frames])
+    start_s = np.array([shutter.first_row_start_s(frame.time_s, frame.exposure_s or 0.0) for frame in frames])
+    seen = (start_s >= late.knots[0][0]) & (start_s <= late.knots[0][-1])
+    found_s = late.at_time(start_s[seen])[:, 0]
+    for rows in FRAMES_OFF:
+        moved = np.clip(np.arange(len(frames)) + rows, 0, len(frames) - 1)
+        other_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(exposure_s[moved] - exposure_s)
+        expected_s = other_s[seen] - np.mean(other_s[seen])
+        if not np.isfinite(expected_s).all() or not np.any(expected_s):
+            continue
+        factor = float(expected_s @ found_s / (expected_s @ expected_s))
+        left_s = found_s - np.mean(found_s) - factor * expected_s
+        if np.var(left_s) < (1 - RIVAL_GAIN_FRACTION) * np.var(found_s) and abs(factor - 1) < FROM_ONE:
+            rival = f"exposure times logged {_apart(rows)}"
+            sentence = f"{finding.sentence}; {rival} would explain it: compare the table with the movie"
+            return replace(finding, confounded=(*finding.confounded, rival), sentence=sentence)
+    return finding
 
 
 def with_followed_log(light: PictureVerdict, frames: Sequence[Frame], each: ParallelMap = one_by_one) -> PictureVerdict:

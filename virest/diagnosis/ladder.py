@@ -28,7 +28,7 @@ from virest.diagnosis.field.brightness import instead_of_cause, light_field, wit
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
-from virest.diagnosis.followed_log import with_followed_log
+from virest.diagnosis.followed_log import with_followed_log, with_late_exposures
 from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
@@ -292,7 +292,9 @@ class DiagnosisSession:
         stages = (self.light, self.blur, self.curve, self.edges)
         findings = [*self.findings, *(finding for stage in stages for finding in stage.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
-        fields = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
+        told = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
+        shutter = self.geometric.model.profile.shutter
+        fields = [with_late_exposures(field, self.capture.frames, shutter) for field in told]
         extended, light = self.curve.profile, self.light
         if (patches := light.observations) is not None:
             name, without, instead = instead_of_cause(patches, extended, {finding.name for finding in findings})
