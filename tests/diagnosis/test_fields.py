@@ -30,7 +30,7 @@ from virest.diagnosis.field.bridging import (
 )
 from virest.diagnosis.field.contradicted import climb_with_bridges, contradicted_stretches
 from virest.diagnosis.field.design import point_residuals
-from virest.diagnosis.field.form_list import forms_of_pairs
+from virest.diagnosis.field.form_list import form_of_late_frames, forms_of_pairs
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import is_believable, with_fields
 from virest.diagnosis.field.stretches import KNOT_STEP_S, bridging_form, rate_walk
@@ -45,6 +45,7 @@ from virest.diagnosis.picture_ladder import PictureVerdict
 from virest.image_formation.point_model import TrackTable
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.profile_terms import FOCAL_DRIFT, GYRO_BIAS, K1, PRINCIPAL_POINT
+from virest.inference.term import slopes_of
 from virest.inference.track_fit import Term, TrackFit
 
 HAND = Setup(
@@ -712,6 +713,20 @@ def test_stamps_that_jitter_are_named_and_each_frame_gets_its_time(rng: np.rando
     off = verdict.model.profile.imu_time_s(stamps) - phone.profile.imu_time_s(stamps) - jitter_s
     assert np.std(off[1:]) < 1e-4  # no pair shows the first frame
     assert parse_profile(profile_mapping(verdict.model.profile)).fields == verdict.model.profile.fields
+
+
+def test_slopes_of_single_frames_delays_are_those_of_difference_quotients() -> None:
+    """Delaying several frames at once, of which no pair has both, gives the slopes of each."""
+    phone = StrangePhone(replace(HAND, seed=93, frames=16), Strange())
+    evidence, fitted, table = fitted_to(phone)
+    seen = point_residuals(evidence.imu, fitted, table)
+    span_s = float(fitted.seconds.min()), float(fitted.seconds.max())
+    for known in (frozenset(), frozenset({"time_offset", "clock_skew"})):
+        form = form_of_late_frames(phone.capture, phone.profile, span_s, known)
+        assert form is not None
+        quick = slopes_of(form.term, phone.profile, table, seen.moved_by)
+        plain = slopes_of(replace(form.term, slopes=None), phone.profile, table, seen.moved_by)
+        np.testing.assert_allclose(quick, plain, atol=1e-3 * np.abs(plain).max())
 
 
 @pytest.mark.parametrize("seed", [94, 95])

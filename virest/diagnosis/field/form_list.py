@@ -71,8 +71,6 @@ def possible_forms(
     drifts += [_drift_form("delay", stamps, stamp, known), _drift_form("scale", fine, stamp, known, local=True)]
     drifts.append(_drift_form("delay", fine_stamps, stamp, known, local=True))
     drifts.append(_drift_form("rate", knots[[0, -1]], stamp, known))
-    if len(starts := _frame_starts_s(capture, profile, span_s)) <= MOST_FRAMES:
-        drifts.append(_late_frames_form(starts, stamp, known))
     places = [*(_place_form(profile, count) for count in (PLACE_KNOTS, FINE_PLACE_KNOTS)), _off_centre_form(profile)]
     forms = [*places, *drifts]
     forms += step_forms(capture, candidate_steps_s(span_s, capture))
@@ -261,8 +259,15 @@ def _frame_starts_s(capture: Capture, profile: CameraProfile, span_s: tuple[floa
     return starts[(starts > begin_s - period_s) & (starts < end_s + period_s)]
 
 
+def form_of_late_frames(
+    capture: Capture, profile: CameraProfile, span_s: tuple[float, float], known: frozenset[str] = frozenset()
+) -> FieldForm | None:
+    """A delay of its own for each frame: stamps that jitter.  None for too many frames."""
+    starts_s = _frame_starts_s(capture, profile, span_s)
+    return _late_frames_form(starts_s, capture.stamp_0_ns, known) if len(starts_s) <= MOST_FRAMES else None
+
+
 def _late_frames_form(starts_s: Array, stamp_0_ns: int, known: frozenset[str]) -> FieldForm:
-    """A delay of its own for each frame: stamps that jitter."""
     made = _drift_form("delay", starts_s, stamp_0_ns, known, local=True)
     return replace(
         made, build=lambda _profile, now: _late_frames_form(starts_s, stamp_0_ns, now), refine=None, by_frame=True

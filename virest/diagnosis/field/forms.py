@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from virest.arrays import Array
+from virest.arrays import Array, Index
 from virest.camera.field import FORCES, RATES, Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.image_formation.point_model import TrackTable
@@ -156,7 +156,19 @@ class FieldForm:
         return Term(self.name, self.change, (step,) * count, (std,) * count, (std,) * count, slopes)
 
     def _late_frames(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> Array:
-        """Slopes (n, 2, k) of a delay of each frame: a point moves with the delays of its two frames alone.
+        """Slopes (n, 2, k) of a delay of each frame: a point moves with the delays of its two frames alone."""
+        per_value = np.zeros((len(table), 2, len(self.fields[0].values)))
+        rows = np.arange(len(table))
+        for end, moved in self._moved_by_ends(profile, table, moved_by):
+            per_value[rows, :, end] = moved
+        return np.asarray(per_value @ self.basis)
+
+    def moved_by_second(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> Array:
+        """Slopes (n, 2) of the points per delay of their second frame, for a form with a knot for each frame."""
+        return self._moved_by_ends(profile, table, moved_by)[1][1]
+
+    def _moved_by_ends(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> list[tuple[Index, Array]]:
+        """For the first and the second frames of the points: their knots (n,), and the slopes (n, 2) per delay of each.
 
         Frames of one colour are delayed at once; no pair has both of its frames in one colour.
         """
@@ -165,14 +177,13 @@ class FieldForm:
         colours = int(np.abs(ends[1] - ends[0]).max()) + 1
         field, step = self.held_in(profile, self.fields[0]), QUOTIENT[self.kind]
         others = [f for f in profile.fields if not _adds_to(field, f)]
-        per_value = np.zeros((len(table), 2, len(knots)))
+        slopes = np.zeros((2, len(table), 2))
         for colour in range(colours):
             late = np.array(field.values) + step * (np.arange(len(knots)) % colours == colour)[:, None]
             moved = moved_by(profile.with_fields([*others, field.with_values(late)])) / step
-            for end in ends:
-                rows = np.flatnonzero(end % colours == colour)
-                per_value[rows, :, end[rows]] = moved[rows]
-        return np.asarray(per_value @ self.basis)
+            for slope, end in zip(slopes, ends, strict=True):
+                slope[end % colours == colour] = moved[end % colours == colour]
+        return list(zip(ends, slopes, strict=True))
 
     def _displaced(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> Array:
         """Slopes (n, 2, k) of a displacement u: u(p₂) − J u(p₁); J follows from shifting both points equally."""

@@ -16,11 +16,13 @@ import numpy as np
 from virest.arrays import Array, Index
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals, point_residuals
-from virest.diagnosis.field.form_list import FRAMES_PER_STEP, forms_of_pairs, possible_forms
+from virest.diagnosis.field.form_list import FRAMES_PER_STEP, form_of_late_frames, forms_of_pairs, possible_forms
 from virest.diagnosis.field.forms import OVER, STD, FieldForm
+from virest.diagnosis.field.late_frames import late_frames_p
 from virest.diagnosis.field.levels import given_value_p, level_cause
 from virest.diagnosis.field.records import FittedField
 from virest.diagnosis.field.screening import (
+    MAX_P,
     MIN_BLOCKS,
     MIN_LOCAL_T,
     MIN_T,
@@ -249,7 +251,7 @@ def _step(
     if entered.form.by_frame:
         excess = max(entered.before.rms**2 - 1.0, 0.0)  # rms is in units of the noise
         shared_px = max(shared_px, typical * np.sqrt(MIN_JITTER_PART * excess))
-    small = gained_px < max(MIN_SIZE_PX if proposal.selection else 0.0, shared_px)
+    small = gained_px < max(0.0 if proposal.sudden else MIN_SIZE_PX, shared_px)
     if small or proposal.instead:
         replaces = len(after.accepted) < len(state.accepted)
         if not replaces or not _is_better(judged, after.model, entered.form):
@@ -271,12 +273,16 @@ class _Proposal:
     form: FieldForm
     selection: Selection | None = None
     sudden: SuddenChange | None = None
+    jitter_p: float | None = None
+    """P value of delays of single frames; None: the form is another."""
     instead: bool = False
     """Whether it may enter only if it replaces a cause."""
 
     @property
     def p_value(self) -> float:
         """For the whole set of forms, or for all pairs."""
+        if self.jitter_p is not None:
+            return self.jitter_p
         return self.selection.best.p_value if self.selection else self.sudden.p_value if self.sudden else 1.0
 
     @property
@@ -305,7 +311,7 @@ def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     if model.terms:
         tangent = np.concatenate([tangent, seen.effect(model.terms)], axis=-1)
     blind_s = FRAMES_PER_STEP * evidence.period_s
-    search = _Search(seen, block, blind_s, len(alone) + len(pairs))
+    search = _Search(seen, block, blind_s, len(alone) + len(pairs) + 1)
     forms = [form for form in alone if form.family not in in_model]
     plain: list[_Proposal] = []
     sudden = None if any(name.startswith(SCALE_OVER_TIME) for name in in_model) else sudden_change(seen)
@@ -329,9 +335,16 @@ def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     forms = [form for form in (*forms, *pairs) if form.local or (form.is_pair and form.family not in in_model)]
     smooth = list({form.family: form for form in reversed(alone) if not form.local and form.step_s is None}.values())
     tangent = np.concatenate([tangent, *map(search.effect, smooth)], axis=-1)
-    if (selection := search.best(search.scored(tangent, forms))) is not None:
-        yield (_Proposal(forms[selection.best.index], selection),)
-    elif sudden is not None:
+    selection = search.best(search.scored(tangent, forms))
+    close = [] if selection is None else [_Proposal(forms[selection.best.index], selection)]
+    late = form_of_late_frames(capture, fitted.profile, span_s, frozenset(in_model))
+    if late is not None and late.family not in in_model:
+        p_value = min(late_frames_p(seen, late) * search.forms_tested, 1.0)
+        log.debug("%s by frame: p %.2g", late.name, p_value)
+        close += [_Proposal(late, jitter_p=p_value)] if p_value < MAX_P else []
+    if close:
+        yield tuple(close)
+    if selection is None and sudden is not None:
         # a temporary change covers too few frames for the sign-flip test
         yield from ((_Proposal(form, sudden=sudden),) for form in forms if form.local and form.kind == "scale")
 
