@@ -47,8 +47,8 @@ def calibrate(
     $ virest calibrate shaken --with focal
     shaken: calibrated
     value                       start     calibrated        ±  determined  note
-    time_offset_s           0.0000000      0.0309982  7.1e-06  yes
-    readout_time_s           0.020000       0.022711  1.2e-05  yes
+    time_offset_s           0.0000000      0.0309982  8.5e-06  yes
+    readout_time_s           0.020000       0.022711  1.5e-05  yes
     readout_direction   right_to_left  right_to_left           yes
     ...
     residual 0.392 -> 0.0702 px (tracking noise 0.0693 px)
