@@ -69,6 +69,20 @@ def test_a_sensor_mounted_at_a_right_angle_is_the_only_cause(turned_deg: tuple[f
     assert verdict.model.profile.rotation_cam_imu == pytest.approx(camera.profile.rotation_cam_imu, abs=2e-3)
 
 
+def test_a_movie_stored_upside_down_before_a_wall_is_explained() -> None:
+    """Axes and readout are reversed, and the wall must lie in front of the camera with the true axes."""
+    camera = Recording(replace(HAND, frames=49, sway_m=0.03, plane_per_m=(0.1, -0.05, 0.6), noise_px=0.05))
+    over = np.diag([-1.0, -1.0, 1.0]) @ camera.profile.rotation_cam_imu
+    other = replace(camera.profile, r_cam_imu=tuple(map(tuple, over.tolist())))
+    other = replace(other.with_shutter(readout_direction="bottom_to_top"), depth_m=None)
+    capture = SimpleNamespace(imu=camera.imu, repeats=())
+    start, terms, _, far, _ = with_null_values(camera.observed, capture, other)  # type: ignore[arg-type]
+    verdict = climb(make_evidence(camera.imu, camera.observed), start, terms, (), far)
+    assert {entry.name for entry in verdict.accepted} == {"imu_rotation", "readout_direction"}
+    assert verdict.final_rms_px < 1.5 * camera.setup.noise_px
+    assert verdict.model.profile.rotation_cam_imu == pytest.approx(camera.profile.rotation_cam_imu, abs=2e-3)
+
+
 @pytest.mark.parametrize("factor", [0.55, 2.5])
 def test_the_focal_length_of_another_lens_is_the_only_cause(factor: float) -> None:
     """The capture is from an ultra-wide or telephoto lens and the profile from the main one."""

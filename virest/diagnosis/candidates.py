@@ -10,7 +10,7 @@ import numpy as np
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
-from virest.diagnosis.geometric_evidence import Evidence, Model, free_scene
+from virest.diagnosis.geometric_evidence import Evidence, Model, base_scene, free_scene
 from virest.image_formation.point_model import TrackTable, integrate_motion, predict
 from virest.inference.recorder_lag import Schedule
 from virest.inference.track_fit import Term
@@ -109,7 +109,12 @@ def candidates_of(
             found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
         far_start = far.start(effect.name, nominal, model.profile, "time_offset" in in_terms)
         if far_start is not None:
-            found.append(Candidate(effect.name, replace(model, profile=far_start), (effect.term,), effect))
+            started = replace(model, profile=far_start)
+            if far_start.r_cam_imu != model.profile.r_cam_imu and model.scene is not None:
+                # a scene in front of the camera with the other axes: a fit would not turn the old one that far
+                table = evidence.table(started, SCREEN_POINTS)
+                started = replace(started, scene=base_scene(evidence, far_start, table))
+            found.append(Candidate(effect.name, started, (effect.term,), effect))
     found += _depth_candidates(evidence, model, tried)
     if "frame_lag" not in tried:
         found += [_lag_candidate(model, *lag) for lag in lags]
