@@ -10,6 +10,7 @@ from diagnosis.test_photometry import FRAMES, NOMINAL, dimmed, hidden, made_obse
 from numpy.typing import NDArray
 
 from virest.camera.field import Field
+from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.records import Frame
 from virest.diagnosis.findings import GEOMETRY, FieldFinding, Finding, HeldOutGain
@@ -108,6 +109,6 @@ def test_delays_of_the_mid_exposures_have_the_exposure_table_as_rival(
     late = Field("delay", ("time",), (tuple(start_s.tolist()),), tuple((float(v),) for v in late_s), (), 0)
     gain = HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1)
     found = FieldFinding(("time",), "delay", "jitter", "late", 0.002, "s", None, gain, 1e-9, (), 1.0, "", "", (late,))
-    told = with_late_exposures(found, frames, shutter)
+    told = with_late_exposures(found, frames, CameraProfile(640, 480, shutter=shutter))
     assert told.confounded == (() if named is None else (f"exposure times logged {named}",))
     assert (told == found) is (named is None)

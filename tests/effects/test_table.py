@@ -62,6 +62,7 @@ OTHER: dict[str, Any] = {
     "clock_skew": lambda p: 0.004,
     "gyro_bias_rad_s": lambda p: (0.03, -0.02, 0.01),
     "gyro_scale": lambda p: (1.02, 0.99, 1.01),
+    "open_imu": lambda p: ("gyro_scale",),
     "response": lambda p: ResponseCurve("gamma"),
     "sensor_width_mm": lambda p: 5.0,
     "sensor_height_mm": lambda p: 4.0,

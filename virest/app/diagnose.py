@@ -34,6 +34,7 @@ from virest.diagnosis.restoration_gain import (
     restore_pairs,
 )
 from virest.errors import OutputError, VirestError
+from virest.image_formation.row_clock import RowClock
 from virest.inference.parallel import ParallelMap, begun, one_by_one
 from virest.report.field_figures import field_figure
 from virest.report.figures import comparison_figure, ladder_figure, residual_figure
@@ -376,8 +377,8 @@ def simulated_frame(capture: Capture, profile: CameraProfile, number: int) -> Pi
 def _blur_px(capture: Capture, profile: CameraProfile, number: int) -> float:
     """Length of a frame's blur at the highest rate in its exposure, by the gyroscope; 0 without a focal length."""
     frame = capture.frames[number]
-    begin_s, exposure_s = float(profile.imu_time_s(frame.time_s)), frame.exposure_s or 0.0
-    during = capture.imu.between(begin_s, begin_s + profile.shutter.readout_time_s + exposure_s)
+    exposure_s, clock = frame.exposure_s or 0.0, RowClock(profile)
+    during = capture.imu.between(clock.time_s(frame.time_s, exposure_s), clock.end_s(frame.time_s, exposure_s))
     if profile.intrinsics is None or not len(during):
         return 0.0
     rate_rad_s = np.linalg.norm(profile.true_rate_rad_s(during.gyro_rad_s), axis=1)

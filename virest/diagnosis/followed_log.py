@@ -18,7 +18,7 @@ from scipy.linalg import null_space
 from virest.arrays import Array, Index
 from virest.camera.field import cardinal_weights
 from virest.camera.profile import CameraProfile
-from virest.camera.shutter import STAMP_FRACTION, Shutter
+from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.records import Frame
 from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION
@@ -28,6 +28,7 @@ from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import FollowedGain
 from virest.diagnosis.photometry_fit import fit_photometry, judge
 from virest.diagnosis.picture_ladder import PictureVerdict
+from virest.image_formation.row_clock import RowClock
 from virest.inference.parallel import ParallelMap, one_by_one
 
 KNOTS = 5
@@ -82,7 +83,7 @@ def _apart(frames_off: int) -> str:
     return f"{count} frame{'s' * (count > 1)} {way}"
 
 
-def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], shutter: Shutter) -> FieldFinding:
+def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], profile: CameraProfile) -> FieldFinding:
     """A delay of frames, with the exposures of other frames as rival if their mid-exposures are delayed like that.
 
     frames: all of the movie, by index.  With the exposure of the frame that is N rows away, mid-exposures move by
@@ -90,9 +91,9 @@ def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], shutter:
     """
     if (finding.kind, finding.covariates) != ("delay", (TIME,)):
         return finding
-    (late,) = finding.fields
+    (late,), shutter, clock = finding.fields, profile.shutter, RowClock(profile)
     exposure_s = np.array([frame.exposure_s or np.nan for frame in frames])
-    start_s = np.array([shutter.first_row_start_s(frame.time_s, frame.exposure_s or 0.0) for frame in frames])
+    start_s = np.array([clock.start_on_camera_s(frame.time_s, frame.exposure_s or 0.0) for frame in frames])
     seen = (start_s >= late.knots[0][0]) & (start_s <= late.knots[0][-1])
     found_s = late.at_time(start_s[seen])[:, 0]
     for rows in FRAMES_OFF:

@@ -293,8 +293,7 @@ class DiagnosisSession:
         findings = [*self.findings, *(finding for stage in stages for finding in stage.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         told = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
-        shutter = self.geometric.model.profile.shutter
-        fields = [with_late_exposures(field, self.capture.frames, shutter) for field in told]
+        fields = [with_late_exposures(field, self.capture.frames, self.geometric.model.profile) for field in told]
         extended, light = self.curve.profile, self.light
         if (patches := light.observations) is not None:
             name, without, instead = instead_of_cause(patches, extended, {finding.name for finding in findings})

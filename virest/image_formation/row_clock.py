@@ -88,6 +88,10 @@ class RowClock:
         exposure_s = shutter.true_exposure_s(logged_exposure_s)
         return row_time_s(first_row_s, shutter.readout_time_s, readout_fraction, exposure_s, exposure_share)
 
+    def start_on_camera_s(self, stamp_s: Any, logged_exposure_s: Any) -> Any:
+        """Start of a frame's first row, camera clock: the time at which fields of delay over time apply."""
+        return self.profile.shutter.first_row_start_s(stamp_s, logged_exposure_s)
+
     def seen_s(
         self, points_px: NDArray[Any], stamp_s: Any, logged_exposure_s: Any, exposure_share: Any = ROW_MIDDLE
     ) -> Array:

@@ -21,6 +21,7 @@ from virest.capture.profile_source import focus_log
 from virest.capture.records import Capture
 from virest.diagnosis.candidates import varies
 from virest.diagnosis.field.forms import EXPOSURE, FORCE_REACH_M_S2, OVER, STEP_EDGE_S, TIME, FieldForm, Recipe
+from virest.image_formation.row_clock import RowClock
 
 ROW_KNOTS, PLACE_KNOTS, RATE_KNOTS, FOCUS_KNOTS = 6, 4, 7, 5
 """Knots of the coarse forms.  The fewer, the weaker an effect they detect: a cubic spline through 4, 5, 6 or 7 knots
@@ -252,8 +253,9 @@ def _drift_form(
 
 def _frame_starts_s(capture: Capture, profile: CameraProfile, span_s: tuple[float, float]) -> Array:
     """Starts of the first row of the frames in a span of IMU time and next to it, camera clock."""
-    frames = [(frame.time_s, frame.exposure_s or 0.0) for frame in capture.frames]
-    starts = np.unique(_rounded(np.array([profile.shutter.first_row_start_s(*frame) for frame in frames])))
+    clock = RowClock(profile)
+    found = [clock.start_on_camera_s(frame.time_s, frame.exposure_s or 0.0) for frame in capture.frames]
+    starts = np.unique(_rounded(np.array(found)))
     begin_s, end_s = (float(profile.camera_time_s(t)) for t in span_s)
     period_s = float(np.median(np.diff(starts)))
     return starts[(starts > begin_s - period_s) & (starts < end_s + period_s)]
