@@ -715,6 +715,17 @@ def test_stamps_that_jitter_are_named_and_each_frame_gets_its_time(rng: np.rando
     assert parse_profile(profile_mapping(verdict.model.profile)).fields == verdict.model.profile.fields
 
 
+@pytest.mark.parametrize("seed", [111, 112, 113])
+def test_stamps_that_jitter_are_named_in_a_second_of_noisy_points(seed: int) -> None:
+    """A few pairs of frames turn fast and gain most: their signs tell more than the mean."""
+    setup = replace(HAND, seed=seed, frames=26, noise_px=0.3, rate_rad_s=1.2)
+    stamps, jitter_s = StrangePhone(setup, Strange()).stamp_s, np.random.default_rng(seed).normal(0.0, 0.004, 26)
+    phone = WanderingPhone(setup, lambda stamp_s: np.interp(stamp_s, stamps, jitter_s))
+    _, (field,) = judged(phone, phone.profile)
+    assert "the frames' stamps jitter" in field.sentence
+    assert field.size == pytest.approx(np.std(jitter_s), abs=3 * field.std)
+
+
 def test_slopes_of_single_frames_delays_are_those_of_difference_quotients() -> None:
     """Delaying several frames at once, of which no pair has both, gives the slopes of each."""
     phone = StrangePhone(replace(HAND, seed=93, frames=16), Strange())

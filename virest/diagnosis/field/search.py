@@ -68,9 +68,9 @@ SCALE_OVER_TIME = f"scale{OVER}time"
 """Once a form of this family is in the model, no further sudden change is searched for."""
 RATE_OVER_TIME = f"rate{OVER}time"
 """A bias that changes smoothly is tried beside one that changes at an instant."""
-MIN_JITTER_PART = 2 / 3
-"""Least part of the excess residual that delays of single frames remove: of the gyroscope's noise, which turns frames
-about three axes, they remove about a third, and of stamps that jitter all."""
+MIN_DELAY_PART = 2 / 3
+"""Least part of the excess residual that delays of single frames, or of a few, remove: of the gyroscope's noise, which
+turns frames about three axes, they remove about a third, and of stamps that jitter all."""
 MIN_EXCESS_REMOVED = 0.5
 """Minimum fraction of the excess loss at a sudden change that a fit to the other blocks must remove."""
 
@@ -248,9 +248,9 @@ def _step(
     typical, left = evidence.typical_px, entered.after.rms
     gained_px = np.sqrt(max(entered.before.rms**2 - left**2, 0.0)) * typical
     shared_px = STRUCTURE_NOISES * left * typical if entered.form.local else 0.0
-    if entered.form.by_frame:
+    if entered.form.local and entered.form.kind == "delay":
         excess = max(entered.before.rms**2 - 1.0, 0.0)  # rms is in units of the noise
-        shared_px = max(shared_px, typical * np.sqrt(MIN_JITTER_PART * excess))
+        shared_px = max(shared_px, typical * np.sqrt(MIN_DELAY_PART * excess))
     small = gained_px < max(0.0 if proposal.sudden else MIN_SIZE_PX, shared_px)
     if small or proposal.instead:
         replaces = len(after.accepted) < len(state.accepted)
