@@ -84,7 +84,7 @@ EVEN_SHARED = 0.006
 the most likely one (0.004) for all values in the 45 captures of :data:`virest.inference.blur_bias.LEFT_BY_EVEN_BLUR`.
 ``python -m virest.app.bench --only calibration`` prints what its captures imply."""
 EVEN_SHARED_READOUT = 0.015
-"""The same for a readout, which coded frames show too short: by 0.13 % (mean of 12 captures of a plane at 0.5 bits per
+"""The same for a readout, which coded frames show too short: by 0.10 % (mean of 12 captures of a plane at 0.5 bits per
 pixel, simulated outside; none of it at 6).  In 24 such captures at 0.12 to 0.5, the rms of error / σ was 1.25 at 0.006,
 1.04 at 0.015 and 0.93 at 0.02."""
 GYRO_WANDER_RAD_S = 5e-5
