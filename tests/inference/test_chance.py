@@ -22,7 +22,7 @@ def test_tails_and_quantiles_are_those_of_the_distributions(rng: np.random.Gener
 
 
 def test_the_sign_test_counts_positive_values() -> None:
-    """The probability that so many of them, or more, are positive where half would be."""
+    """The p value is the probability of at least as many positive values if half are expected."""
     assert chance.sign_tail(np.r_[np.ones(30), -np.ones(5)]) == pytest.approx(stats.binom.sf(29, 35, 0.5), rel=1e-9)
     assert chance.sign_tail(-np.ones(5)) == 1.0
 

@@ -382,7 +382,7 @@ def _blur_px(capture: Capture, profile: CameraProfile, number: int) -> float:
     if profile.intrinsics is None or not len(during):
         return 0.0
     rate_rad_s = np.linalg.norm(profile.true_rate_rad_s(during.gyro_rad_s), axis=1)
-    return float(rate_rad_s.max()) * exposure_s * profile.intrinsics.fx_px
+    return float(rate_rad_s.max()) * profile.shutter.true_exposure_s(exposure_s) * profile.intrinsics.fx_px
 
 
 # ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -278,9 +278,10 @@ def _with_other_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraP
 
 def other_reading(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> str:
     """What the gyroscope explains if its log has another unit or sign, and what to do; empty: not enough either."""
+    turns = observed.turns(profile)
     for factor, own_axes, words in READINGS:
         read = replace(imu, gyro_rad_s=factor * imu.gyro_rad_s)
-        coarse = align_coarsely(observed.turns(profile), read, profile, own_axes=own_axes)
+        coarse = align_coarsely(turns, read, profile, own_axes=own_axes)
         if coarse is not None and not coarse.doubt(len(observed.pairs), observed.lens.fx_px):
             return f"{words} it would explain {coarse.explained:.0%}: correct gyro_accel.csv"
     return ""
