@@ -55,6 +55,7 @@ extensions:                                  # what a diagnosis added; an absent
   focal_drift: {focal_drift_per_s: 0.0}
   stabilisation: {fraction: 0.0, cutoff_hz: 1.0}
   frame_lag: {lag_s: 0.0, frames: 0}
+  exposures_late_frames: 0
   response_gamma: 1.0
   black_level: 0.0
   vignetting: {corner_loss: 0.0}
@@ -87,7 +88,7 @@ FULL = CameraProfile(
         "gyro_bias_rad_s": Estimate([1e-3, 0.0, 0.02], [1e-4, 1e-4, 2e-4], "the same"),
         "readout_direction": Estimate("bottom_to_top", None, "likelihood"),
     },
-    extensions=Extensions(0.01, 0.6, 2.5, 0.3, 17, 0.35, 0.1, 120.0, 0.7, (1.0, 0.97, 1.02), 0.8),
+    extensions=Extensions(0.01, 0.6, 2.5, 0.3, 17, 0.35, 0.1, 120.0, 0.7, (1.0, 0.97, 1.02), 0.8, exposures_late_frames=2),
 )
 
 

@@ -80,6 +80,7 @@ OTHER_EXTENSION: dict[str, Any] = {
     "stabilisation_lean_rad": (0.01, -0.02),
     "frame_lag_s": 0.1,
     "frame_lag_frames": 3,
+    "exposures_late_frames": 2,
     "vignetting_corner_loss": 0.3,
     "flicker_amplitude": 0.5,
     "flicker_frequency_hz": 120.0,

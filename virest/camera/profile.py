@@ -59,6 +59,8 @@ class Extensions:
     """Standard deviation of the time over which the gyroscope averages, beyond the low pass; 0: none."""
     gyro_misalignment_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """xy, xz, yz: part of an axis's rate that the other axis of the pair reads too; 0 where they are perpendicular."""
+    exposures_late_frames: int = 0
+    """Rows by which exposure times and ISO values are logged late: frame k's are in row k + this many."""
     stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
     """θ about x and y at the start of the inertial log; fitted but not stored in files: its effect decays soon."""
     field: tuple[ModelField, ...] = ()

@@ -87,6 +87,7 @@ def _from_model(model: ProfileFile) -> CameraProfile:
             stabilisation_cutoff_hz=extensions.stabilisation.cutoff_hz,
             frame_lag_s=extensions.frame_lag.lag_s,
             frame_lag_frames=extensions.frame_lag.frames,
+            exposures_late_frames=extensions.exposures_late_frames,
             vignetting_corner_loss=extensions.vignetting.corner_loss,
             flicker_amplitude=extensions.flicker.amplitude,
             flicker_frequency_hz=extensions.flicker.frequency_hz,
@@ -214,6 +215,8 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         }
     if ext.frame_lag_frames:
         extensions["frame_lag"] = {"lag_s": ext.frame_lag_s, "frames": ext.frame_lag_frames}
+    if ext.exposures_late_frames:
+        extensions["exposures_late_frames"] = ext.exposures_late_frames
     if profile.response and profile.response.extra_gamma != 1.0:
         extensions["response_gamma"] = profile.response.extra_gamma
     if profile.response and profile.response.black_level:

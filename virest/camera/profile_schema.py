@@ -171,7 +171,7 @@ class FieldBlock(_Strict):
     version: Literal[1, 2] = 1
     kind: Literal["delay", "displacement", "scale", "rate", "gain", "blur"]
     covariates: Annotated[list[str], Field(min_length=1, max_length=2)]
-    knots: Annotated[list[Annotated[list[Number], Field(max_length=500)]], Field(min_length=1, max_length=2)]
+    knots: Annotated[list[Annotated[list[Number], Field(max_length=4096)]], Field(min_length=1, max_length=2)]
     values: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)]
     std: Annotated[list[Annotated[list[Number], Field(max_length=3)]], Field(max_length=4096)] = []
     stamp_0_ns: int | None = None
@@ -183,6 +183,7 @@ class ExtensionsBlock(_Strict):
     focal_drift: _FocalDrift = _FocalDrift()
     stabilisation: _Stabilisation = _Stabilisation()
     frame_lag: _FrameLag = _FrameLag()
+    exposures_late_frames: Annotated[int, Field(ge=-10, le=10)] = 0
     response_gamma: Positive = 1.0
     black_level: Annotated[Number, Field(ge=0, lt=0.9)] = 0.0
     vignetting: _Vignetting = _Vignetting()

@@ -224,8 +224,9 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     frame_lag: slot k shows capture k + lag − repeats so far; exact repeats reduce the lag to 0 over the first slots.
     repeats: slots observed to repeat.  If their number differs from the lag, repeats are assumed evenly spaced, unless
     the movie ends before the lag reaches 0: then the observed ones are used, and all slots keep the remaining lag.
-    Frames that were skipped only for the start-up become usable.
+    Frames that were skipped only for the start-up become usable.  Exposures logged in other rows are given back.
     """
+    frames = with_own_exposures(frames, profile.extensions.exposures_late_frames)
     lagging = profile.extensions.frame_lag_frames
     period_s = median_period_s(np.array([frame.time_s for frame in frames]))
     periods = profile.extensions.frame_lag_s / period_s if period_s > 0 else 0.0
@@ -242,6 +243,20 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     shows = np.arange(len(frames)) + lag - np.searchsorted(used, np.arange(len(frames)), side="right")
     early = [_showing(frame, frames, int(shows[k]), period_s, rest_s) for k, frame in enumerate(frames[: last + 1])]
     return (*early, *frames[last + 1 :])
+
+
+def with_own_exposures(frames: Sequence[Frame], rows_late: int) -> tuple[Frame, ...]:
+    """The frames with the exposure times and ISO values logged for the frames ``rows_late`` later; the last ones stay.
+
+    Those before the first or after the last row keep the nearest one.
+    """
+    if not rows_late:
+        return tuple(frames)
+    sources = np.clip(np.arange(len(frames)) + rows_late, 0, len(frames) - 1)
+    own = (frames[int(k)] for k in sources)
+    return tuple(
+        replace(frame, exposure_s=source.exposure_s, iso=source.iso) for frame, source in zip(frames, own, strict=True)
+    )
 
 
 def _showing(frame: Frame, frames: Sequence[Frame], capture: int, period_s: float, later_s: float) -> Frame:

@@ -38,7 +38,13 @@ from virest.inference.visual_inertial import align, choose_runs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.restoration.blur_length_check import TilePowers, frames_to_measure, path_scale, store_powers
-from virest.restoration.capture import FOCAL_UNKNOWN, RestorationPlan, at_true_times, moved_over_frame
+from virest.restoration.capture import (
+    FOCAL_UNKNOWN,
+    RestorationPlan,
+    at_true_times,
+    moved_over_frame,
+    with_own_exposures,
+)
 from virest.restoration.conflict_plan import (
     MAX_FOCAL_SPREAD,
     MAX_OFFSET_STD_S,
@@ -47,6 +53,7 @@ from virest.restoration.conflict_plan import (
     explains_points,
     settle,
 )
+from virest.restoration.frame_time_plan import find_frame_times, for_late_exposures
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbour_plan import with_neighbour_survey
 from virest.restoration.neighbours.survey import store_lumas, survey_runs
@@ -78,6 +85,10 @@ def plan_restoration(
     steps: the coder's quantiser step by frame index, filled in as frames are read; missing: unknown.
     """
     steps = {} if steps is None else steps
+    if rows := profile.extensions.exposures_late_frames:
+        capture = replace(capture, frames=with_own_exposures(capture.frames, rows))
+        even = profile.with_extensions(exposures_late_frames=0)
+        return for_late_exposures(plan_restoration(capture, even, settings, read_gray, steps), rows)
     lag = None if settings.keep_start_up else find_lag(capture, profile, read_gray)
     if lag is None:
         return _planned(capture, profile, settings, read_gray, steps)
@@ -130,6 +141,12 @@ def _planned(
             alignment = _aligned(settled.profile, profile, capture, all_pairs)
             settled = _with_clock(settled, profile, alignment)
         plan = settled
+    if plan.refusal is None:
+        times = find_frame_times(plan, profile, capture, tracked, lambda n: track_pairs(read_gray(n), guide=guide))
+        if times is not None:
+            again = _planned(times.capture, times.profile, settings, read_gray, steps)
+            if times.explain(plan, again):
+                return times.noted(again)
     if plan.refusal is None and not _clock_agrees(alignment, plan.profile):
         resting = _through_resting_lens(tracked, capture, plan.profile)
         agreement = check_agreement(observe_tracks(capture, resting, plan.profile), capture.imu, plan.profile)

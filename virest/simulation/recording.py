@@ -291,8 +291,10 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
     fx, fy = (f"{lens.fx_px:.7g}", f"{lens.fy_px:.7g}") if lens else ("1.0", "1.0")
     readout = round(nominal.shutter.readout_time_s * 1e9)
     rows = []
+    last = len(session.stamp_ns) - 1
     for k, stamp in enumerate(session.stamp_ns.tolist()):
-        exposure = session.logged_exposure_s(k)
+        own = min(max(k - session.nominal.extensions.exposures_late_frames, 0), last)
+        exposure, iso = session.logged_exposure_s(own), int(session.exposures.iso[own])
         numbers = [
             _logged_ns(stamp, options),
             fx,
@@ -304,7 +306,7 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
         focus = FOCUS_DIOPTRES
         if session.hidden.focus_dioptres is not None:
             focus = float(session.hidden.focus_dioptres(np.array((stamp - session.stamp_ns[0]) * 1e-9)))
-        numbers += [readout, int(session.exposures.iso[k]), nominal.focal_length_mm or 3.95, focus, 3]
+        numbers += [readout, iso, nominal.focal_length_mm or 3.95, focus, 3]
         rows.append([str(n) for n in [*numbers, _unix_ns(stamp, 50_000_000)]])
     columns = ["Timestamp[nanosec]", "fx[px]", "fy[px]", "Frame No.", "Exposure time[nanosec]"]
     columns += [

@@ -111,7 +111,9 @@ def from_frame(profile: CameraProfile, frames: Sequence[Frame]) -> CameraProfile
     extensions, index = changed.extensions, [frame.index for frame in frames]
     lag_s, lag_frames = _lag_left(extensions, index[0])
     gain = tuple(extensions.gain[i] if i < len(extensions.gain) else 1.0 for i in index) if extensions.gain else ()
-    extensions = dataclasses.replace(extensions, gain=gain, frame_lag_s=lag_s, frame_lag_frames=lag_frames)
+    extensions = dataclasses.replace(
+        extensions, gain=gain, frame_lag_s=lag_s, frame_lag_frames=lag_frames, exposures_late_frames=0
+    )
     return dataclasses.replace(
         changed, time_offset_s=changed.time_offset_s or 0.0, depth_m=np.inf, extensions=extensions
     )

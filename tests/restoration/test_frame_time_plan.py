@@ -1,0 +1,114 @@
+"""Plans for captures whose stamps jitter, or whose exposure times are in other frames' rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from virest.app.simulate import simulate_command
+from virest.camera.profile import CameraProfile
+from virest.camera.profile_file import read_profile, write_profile
+from virest.capture.folder import read_capture, resolve_profile
+from virest.capture.records import Capture
+from virest.capture.video import probe_movie, read_decodable_gray
+from virest.image_formation.row_clock import RowClock
+from virest.restoration.capture import RestorationPlan, with_own_exposures
+from virest.restoration.capture_estimation import plan_restoration
+from virest.restoration.plan_notes import NoteCode
+from virest.restoration.settings import PRESETS
+
+Film = Callable[[Capture], RestorationPlan]
+FRAMES = 40
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """A hand-held capture whose exposure differs from frame to frame."""
+    folder = tmp_path_factory.mktemp("captures") / "hand"
+    simulate_command(
+        folder, width=320, height=240, frames=FRAMES, seed=8, rate_rad_s=1.2, exposure_ms=[3.0, 12.0, 6.0, 18.0, 9.0],
+        noise_levels=1.0, bitrate_bits_per_px=1.5,
+    )  # fmt: skip
+    return read_capture(folder)
+
+
+def planned(capture: Capture, profile: CameraProfile | None = None) -> RestorationPlan:
+    """The plan of ``process --preset fast``."""
+    read = partial(read_decodable_gray, capture.movie, probe_movie(capture.movie))
+    return plan_restoration(capture, profile or resolve_profile(capture)[0], PRESETS["fast"], read)
+
+
+def said(plan: RestorationPlan) -> list[str]:
+    """Notes about the times of frames."""
+    return [note.text for note in plan.said if note.code is NoteCode.TRUE_TIMES]
+
+
+def middles_s(capture: Capture, plan: RestorationPlan) -> np.ndarray:
+    """Mid-exposure of the middle rows by a plan, IMU clock."""
+    frames = with_own_exposures(capture.frames, plan.profile.extensions.exposures_late_frames)
+    stamp_s, exposure_s = (np.array([getattr(f, name) for f in frames]) for name in ("time_s", "exposure_s"))
+    return np.asarray(RowClock(plan.profile).middle_s(stamp_s, exposure_s))
+
+
+def test_right_stamps_and_exposures_stay(capture: Capture) -> None:
+    """No note, no delay, no shift of rows."""
+    plan = planned(capture)
+    assert not said(plan)
+    assert not plan.profile.extensions.field
+    assert plan.profile.extensions.exposures_late_frames == 0
+
+
+def test_frames_with_jittering_stamps_are_used_when_their_points_were_seen(capture: Capture) -> None:
+    """Nine tenths of a jitter of 4 ms are removed, and the note says how large it was."""
+    right = middles_s(capture, planned(capture))
+    jitter_s = np.random.default_rng(3).normal(0, 0.004, FRAMES)
+    moved = tuple(replace(f, time_s=f.time_s + float(jitter_s[f.index])) for f in capture.frames)
+    shaken = replace(capture, frames=moved)
+    plan = planned(shaken)
+    (text,) = said(plan)
+    assert "stamps differ from frame to frame" in text
+    off_s = middles_s(shaken, plan) - right
+    assert np.std(off_s) < 0.1 * np.std(jitter_s)
+    (field,) = plan.profile.extensions.field
+    assert field.stamp_0_ns == capture.stamp_0_ns
+    late_s, std_s = np.array(field.values)[:, 0], np.array(field.std)[:, 0]
+    assert np.mean(np.abs(late_s + jitter_s - np.mean(late_s + jitter_s)) < 2 * std_s + 2e-4) > 0.9
+
+
+@pytest.mark.parametrize("rows", [2, -1])
+def test_exposures_in_other_rows_are_given_back_to_their_frames(capture: Capture, rows: int) -> None:
+    """The plan's profile says by how many rows, and a run with that profile finds no more of them.
+
+    The last frames, whose rows were never written, may be given delays of their own.
+    """
+    late = replace(capture, frames=with_own_exposures(capture.frames, -rows))
+    plan = planned(late)
+    assert f"logged {abs(rows)} frame" in said(plan)[-1]
+    assert plan.profile.extensions.exposures_late_frames == rows
+    again = planned(late, resolve_profile(capture)[0].with_extensions(exposures_late_frames=rows))
+    assert not any("logged" in text for text in said(again))
+    assert again.profile.extensions.exposures_late_frames == rows
+    inner = slice(2, -2)
+    np.testing.assert_allclose(middles_s(late, again)[inner], middles_s(capture, planned(capture))[inner], atol=4e-4)
+
+
+def test_a_profile_that_delays_frames_already_is_taken_as_it_is(capture: Capture) -> None:
+    """The field that a diagnosis or an earlier plan has found is not searched for again."""
+    jitter_s = np.random.default_rng(4).normal(0, 0.004, FRAMES)
+    moved = tuple(replace(f, time_s=f.time_s + float(jitter_s[f.index])) for f in capture.frames)
+    shaken = replace(capture, frames=moved)
+    found = planned(shaken)
+    given = resolve_profile(capture)[0].with_fields(found.profile.fields)
+    assert not said(planned(shaken, given))
+
+
+def test_the_file_of_a_profile_keeps_the_rows(tmp_path: Path, capture: Capture) -> None:
+    """``exposures_late_frames`` is written and read."""
+    profile = resolve_profile(capture)[0].with_extensions(exposures_late_frames=-2)
+    write_profile(profile, tmp_path / "camera.yaml")
+    assert read_profile(tmp_path / "camera.yaml").extensions.exposures_late_frames == -2

@@ -1,0 +1,160 @@
+"""Plan with frames at the times that their points show: stamps that jitter, and exposure times of other rows.
+
+Both delay each frame by an amount of its own, in mid-exposure.  The first is a delay per frame; the second follows from
+the logged exposures, so it needs no numbers.  Their likelihoods decide.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from virest.arrays import Array
+from virest.camera.field import Field
+from virest.camera.profile import CameraProfile
+from virest.capture.records import Capture, Frame
+from virest.image_formation.row_clock import RowClock
+from virest.inference.frame_delays import FrameDelays, Turns, fit_frame_delays, unexplained_turns
+from virest.inference.observed_tracks import observe_tracks
+from virest.inference.tracking import TrackPair
+from virest.restoration.capture import RestorationPlan, with_own_exposures
+from virest.restoration.plan_notes import NoteCode
+from virest.restoration.profile_conflict import CONTRADICTED, MOST_LEFT, VALUE_P
+
+log = logging.getLogger(__name__)
+
+POINTS_PER_PAIR = 60
+"""Points of a pair that are used: three numbers are fitted to them."""
+ROWS_LATE = (1, -1, 2, -2)
+"""Rows by which a table of exposures may lag (+) or lead (−) the movie."""
+MOST_FRAMES = 3000
+"""Most frames of a movie that are tracked for delays of their own: a minute or two of 640×480."""
+SOURCE = "tracked points against the gyroscope, frame by frame"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTimes:
+    """Times of frames that explain the points better than their stamps do."""
+
+    capture: Capture
+    """With the exposures that the frames had."""
+    profile: CameraProfile
+    """The given one, with a delay for each frame."""
+    rows_late: int
+    """Rows by which exposures are logged late."""
+    text: str
+    """Message about it."""
+
+    def explain(self, before: RestorationPlan, after: RestorationPlan) -> bool:
+        """Whether most of what contradicts the points is gone with these times, and no frame is lost."""
+        if after.refusal is not None and before.refusal is None:
+            return False
+        left, rest = (plan.points_off_rad_s or 0.0 for plan in (before, after))
+        return rest**2 <= MOST_LEFT * left**2
+
+    def noted(self, plan: RestorationPlan) -> RestorationPlan:
+        """The plan that was made with these times, for the capture as it was read."""
+        return for_late_exposures(plan, self.rows_late).noted(NoteCode.TRUE_TIMES, self.text)
+
+
+def for_late_exposures(plan: RestorationPlan, rows_late: int) -> RestorationPlan:
+    """A plan that was made with the frames' own exposures, for a capture whose rows of them are late."""
+
+    def changed(profile: CameraProfile) -> CameraProfile:
+        return profile.with_extensions(exposures_late_frames=profile.extensions.exposures_late_frames + rows_late)
+
+    contradicted = None if plan.contradicted is None else changed(plan.contradicted)
+    return replace(plan, profile=changed(plan.profile), contradicted=contradicted)
+
+
+def find_frame_times(
+    plan: RestorationPlan,
+    given: CameraProfile,
+    capture: Capture,
+    pairs: Sequence[TrackPair],
+    track_all: Callable[[Sequence[int]], Sequence[TrackPair]],
+) -> FrameTimes | None:
+    """Times of frames that tracked points require; None if stamps and logged exposures explain them.
+
+    pairs: of the frames that planning looks at.  track_all: tracks other frames, by movie index, if it must be known
+    when each frame was taken.
+    """
+    profile = plan.profile
+    if profile.intrinsics is None or profile.time_offset_s is None or has_frame_delays(profile):
+        return None
+    turns = _turns(capture, pairs, profile)
+    found = None if turns is None else fit_frame_delays(turns)
+    if turns is None or found is None or found.p >= VALUE_P:
+        return None
+    noise_px = float(np.median(observe_tracks(capture, pairs, profile).noise_px))
+    moved_px = found.jitter_s * turns.rate_rad_s * profile.intrinsics.fx_px
+    log.debug("frames' delays of %.2g s (p = %.2g) move points by %.2g px", found.jitter_s, found.p, moved_px)
+    if moved_px < np.sqrt(CONTRADICTED**2 - 1) * noise_px:
+        return None
+    rows = _rows_late(capture, pairs, profile, found)
+    if rows:
+        frames = f"{abs(rows)} frame{'s' * (abs(rows) > 1)} {'late' if rows > 0 else 'early'}"
+        text = f"exposure times are logged {frames}: each frame is restored with its own"
+        return FrameTimes(replace(capture, frames=with_own_exposures(capture.frames, rows)), given, rows, text)
+    usable = [frame for frame in capture.frames if frame.skip_reason is None]
+    if len(usable) > MOST_FRAMES:
+        return None
+    if {frame.index for frame in usable} - {n for pair in pairs for n in (pair.first, pair.second)}:
+        more = _turns(capture, track_all([frame.index for frame in usable]), profile)
+        found = (fit_frame_delays(more) if more is not None else None) or found
+    text = (
+        f"stamps differ from frame to frame by {1e3 * found.jitter_s:.1f} ms (rms) from the times that points show, "
+        "which are used instead"
+    )
+    return FrameTimes(capture, _with_delays(given, profile, capture, usable, found), 0, text)
+
+
+def has_frame_delays(profile: CameraProfile) -> bool:
+    """Whether the profile delays whole frames already."""
+    return any((field.kind, field.covariates) == ("delay", ("time",)) for field in profile.extensions.field)
+
+
+def _turns(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile) -> Turns | None:
+    observed = observe_tracks(capture, pairs, profile).covered(capture.imu, profile)
+    if not observed.pairs:
+        return None
+    return unexplained_turns(capture.imu, observed.table(POINTS_PER_PAIR * len(observed.pairs)), profile)
+
+
+def _rows_late(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile, delays: FrameDelays) -> int:
+    """Rows by which exposures are logged late, if that is likelier than the log by far; else 0.
+
+    Of two hypotheses, the wrong one is k times as likely as the right one with a probability of at most 1 / k (Markov's
+    inequality).  Both have delays besides, so that neither needs to explain everything.
+    """
+    if len({frame.exposure_s for frame in capture.frames}) < 2:
+        return 0
+    costs: dict[int, float] = {}
+    for rows in ROWS_LATE:
+        moved = replace(capture, frames=with_own_exposures(capture.frames, rows))
+        turns = _turns(moved, pairs, profile)
+        found = None if turns is None else fit_frame_delays(turns)
+        if found is not None:
+            costs[rows] = found.cost
+    best = min(costs, key=costs.__getitem__, default=0)
+    return best if costs and costs[best] < delays.cost - np.log(len(ROWS_LATE) / VALUE_P) else 0
+
+
+def _with_delays(
+    given: CameraProfile, profile: CameraProfile, capture: Capture, usable: Sequence[Frame], found: FrameDelays
+) -> CameraProfile:
+    """The given profile with a delay for each usable frame, none for those whose points do not show it."""
+    clock = RowClock(profile)
+    late = dict(zip(found.frame.tolist(), zip(found.late_s, found.std_s, strict=True), strict=True))
+    starts = {float(clock.start_on_camera_s(f.time_s, f.exposure_s or 0.0)): f.index for f in usable}
+    knots = sorted(starts)
+    values = np.array([late.get(starts[knot], (0.0, found.jitter_s)) for knot in knots])
+    field = Field("delay", ("time",), (tuple(knots),), _column(values[:, 0]), _column(values[:, 1]), capture.stamp_0_ns)
+    return given.with_fields([*given.fields, field])
+
+
+def _column(values: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple((float(value),) for value in values)
