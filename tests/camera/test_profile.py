@@ -88,7 +88,9 @@ FULL = CameraProfile(
         "gyro_bias_rad_s": Estimate([1e-3, 0.0, 0.02], [1e-4, 1e-4, 2e-4], "the same"),
         "readout_direction": Estimate("bottom_to_top", None, "likelihood"),
     },
-    extensions=Extensions(0.01, 0.6, 2.5, 0.3, 17, 0.35, 0.1, 120.0, 0.7, (1.0, 0.97, 1.02), 0.8, exposures_late_frames=2),
+    extensions=Extensions(
+        0.01, 0.6, 2.5, 0.3, 17, 0.35, 0.1, 120.0, 0.7, (1.0, 0.97, 1.02), 0.8, exposures_late_frames=2
+    ),  # fmt: skip,
 )
 
 
