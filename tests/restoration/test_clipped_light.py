@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from virest.image_formation.kernels import KernelField
-from virest.restoration.clipped_light import _along_paths, unmeasured_masks
+from virest.restoration.clipped_light import along_paths, unmeasured_masks
 
 WIDTH, HEIGHT, LENGTH = 160, 120, 12.0
 
@@ -23,14 +23,11 @@ def field(centres_px: np.ndarray) -> KernelField:
     return KernelField(centres_px, paths, 0.0)
 
 
-BLURRED = SimpleNamespace(field=field, longest_px=LENGTH)
-
-
 def test_a_highlight_spreads_along_its_local_path() -> None:
     """The left highlight's streak is horizontal, the right one's vertical."""
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[55:58, 40] = mask[55:58, 120] = 1
-    touched = _along_paths(mask, BLURRED, cv2.dilate)  # type: ignore[arg-type]
+    touched = along_paths(mask, field, cv2.dilate)
     left, right = touched[:, : WIDTH // 2], touched[:, WIDTH // 2 :]
     assert np.ptp(np.flatnonzero(left.any(axis=0))) >= 2 * LENGTH
     assert np.ptp(np.flatnonzero(left.any(axis=1))) <= 6
@@ -43,11 +40,14 @@ def test_parts_meet_without_a_seam(level: float) -> None:
     """If all paths are equal, the parts give the result of the whole frame, for much and for little clipped area."""
     rng = np.random.default_rng(4)
     mask = (cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 3) > level).astype(np.uint8)
-    same = SimpleNamespace(field=lambda c: field(np.zeros_like(c)), longest_px=LENGTH)
+
+    def even(centres_px: np.ndarray) -> KernelField:
+        return field(np.zeros_like(centres_px))
+
     path = field(np.zeros((1, 2))).arrays(positive=True)[0]
     reach = (path + path[::-1, ::-1] > 2e-3).astype(np.uint8)
     for operation in (cv2.dilate, cv2.erode):
-        np.testing.assert_array_equal(_along_paths(mask, same, operation), operation(mask, reach))  # type: ignore[arg-type]
+        np.testing.assert_array_equal(along_paths(mask, even, operation), operation(mask, reach))
 
 
 def test_a_single_clipped_pixel_is_not_kept_as_recorded() -> None:

@@ -228,7 +228,7 @@ class _System:
             unit = np.zeros((len(self.pull), len(part)))
             unit[4 * part, np.arange(len(part))] = 1.0
             variance[part] += cho_solve_banded(factor, unit)[4 * part, np.arange(len(part))]
-        return np.asarray(UNIT_S * late), np.asarray(UNIT_S * np.sqrt(variance))
+        return np.asarray(UNIT_S * late, float), np.asarray(UNIT_S * np.sqrt(variance), float)
 
 
 def _clock(place: Index, count: int) -> Array:
@@ -248,7 +248,7 @@ def _turns_of(table: TrackTable, per_turn: Array, moved: Array, weight: Array) -
     information, pull = np.zeros((table.n_pairs, 3, 3)), np.zeros((table.n_pairs, 3))
     np.add.at(information, table.pair, np.einsum("nij,nik,n->njk", per_turn, per_turn, weight))
     np.add.at(pull, table.pair, np.einsum("nij,ni,n->nj", per_turn, moved, weight))
-    return np.linalg.solve(information, pull[..., None])[..., 0], information
+    return np.asarray(np.linalg.solve(information, pull[..., None])[..., 0], float), information
 
 
 def _delayed(table: TrackTable, first_s: float, second_s: float) -> TrackTable:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.blur import Image
-from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture, around
+from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture, FieldMaker, around
 from virest.restoration.row_chunks import RowRenderer
 
 LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
@@ -29,7 +29,7 @@ def near_clipped(blurred: BlurredPicture) -> Image | None:
     holes = blurred.holes
     if holes is None:
         return None
-    touched = _along_paths(holes.astype(np.uint8), blurred, cv2.dilate)
+    touched = along_paths(holes.astype(np.uint8), blurred.field, cv2.dilate)
     side = 2 * int(np.ceil(blurred.longest_px / 2 + CODEC_REACH_PX)) + 1
     around = cv2.dilate(touched, np.ones((side, side), np.uint8)).astype(np.float32)
     return cv2.blur(around, (side, side))
@@ -67,7 +67,7 @@ def unmeasured_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
         return [None] * len(blurred.light)
     masks: list[NDArray[np.uint8] | None] = []
     for pair in zip(blurred.dark, blurred.clipped, strict=True):
-        eroded = [_along_paths(mask.astype(np.uint8), blurred, cv2.erode) for mask in pair if mask is not None]
+        eroded = [along_paths(mask.astype(np.uint8), blurred.field, cv2.erode) for mask in pair if mask is not None]
         mask = np.maximum.reduce(eroded) if eroded else None
         masks.append(mask if mask is not None and cv2.hasNonZero(mask) else None)
     return masks
@@ -92,9 +92,7 @@ def keep_unmeasured(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: Bl
     return kept
 
 
-def _along_paths(
-    mask: NDArray[np.uint8], blurred: BlurredPicture, operation: Callable[[Any, Any], Any]
-) -> NDArray[np.uint8]:
+def along_paths(mask: NDArray[np.uint8], field: FieldMaker, operation: Callable[[Any, Any], Any]) -> NDArray[np.uint8]:
     """A mask (height, width) dilated or eroded along the local blur path, in both directions.
 
     Paths vary over a picture with row time and lens: each of PLACES × PLACES parts uses the path at its centre.  Parts
@@ -109,7 +107,7 @@ def _along_paths(
         for left, right in pairwise(columns.tolist())
     ]
     middles = [[(c.start + c.stop - 1) / 2, (r.start + r.stop - 1) / 2] for r, c in parts]
-    paths = blurred.field(np.array(middles)).arrays(positive=True)
+    paths = field(np.array(middles)).arrays(positive=True)
     found, margin = mask.copy(), len(paths[0])
     for (r, c), path in zip(parts, paths, strict=True):
         top, left = max(r.start - margin, 0), max(c.start - margin, 0)

@@ -13,7 +13,9 @@ from virest.arrays import Array
 from virest.image_formation.blur import Image
 from virest.restoration import tiles
 from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
+from virest.restoration.clipped_light import along_paths
 from virest.restoration.neighbours.joint import NeighbourPicture
+from virest.restoration.neighbours.registration import CLIPPED_LIGHT
 from virest.restoration.settings import RestorationSettings
 from virest.restoration.statistics.on_tiles import on_spectrum, packed, packed_frequency
 from virest.restoration.statistics.records import PictureStatistics
@@ -206,30 +208,33 @@ def join_neighbours(
     if not blurred.neighbours:
         return
     centres_px = (deconvolution.grid.centres_px + 0.5) * scale - 0.5
-    size, highlights, further = own[0].shape[::-1], _reached_by_highlights(blurred), []
+    size, further = own[0].shape[::-1], []
     for neighbour in blurred.neighbours:
         one = neighbour.registration
         kernels = one.field(centres_px).scaled(1 / scale).arrays()
         stds_px = STD_STEP_PX * np.round(one.std_at_px(centres_px) / STD_STEP_PX)
         kept = [_kept_sharpness(std_px / scale, deconvolution.size) for std_px in stds_px.tolist()]
         trust = cv2.resize(one.trust, size, interpolation=cv2.INTER_LINEAR)
-        if highlights is not None:
-            trust[cv2.resize(highlights, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
+        unknown = _beyond_range(blurred, neighbour)
+        if unknown is not None:
+            trust[cv2.resize(unknown, size, interpolation=cv2.INTER_AREA) > 0] = 0.0
         variance = None if one.spread is None else packed(one.spread.variance(deconvolution.size, 1 / scale))
         weight = one.coding_noise_ratio
         further.append(tiles.FurtherPicture(channels(neighbour), kernels, kept, trust, weight, variance))
     deconvolution.join(own, further, ratio, factors)
 
 
-def _reached_by_highlights(blurred: BlurredPicture) -> Image | None:
-    """1.0 where the frame's clipped highlights may reach in any neighbour, (height, width); None: nowhere.
+def _beyond_range(blurred: BlurredPicture, neighbour: NeighbourPicture) -> Image | None:
+    """1.0 where a neighbour is clipped, and where it shows the frame's clipped highlights, (height, width); or None.
 
-    They were removed from the frame's tiles, but not from the neighbours.
+    These were removed from the frame's tiles, but not from the neighbours.
     """
-    if blurred.holes is None:
-        return None
-    side = 2 * int(np.ceil(blurred.longest_px + CODEC_REACH_PX)) + 1
-    return cv2.dilate(blurred.holes, np.ones((side, side), np.uint8))
+    rim = np.ones((2 * int(np.ceil(CODEC_REACH_PX)) + 1,) * 2, np.uint8)
+    clipped = (neighbour.light * np.float32(neighbour.registration.gain) > CLIPPED_LIGHT).astype(np.uint8)
+    if blurred.holes is not None:
+        shown = along_paths(blurred.holes.astype(np.uint8), neighbour.registration.field, cv2.dilate)
+        clipped = cv2.max(clipped, shown)
+    return cv2.dilate(clipped, rim).astype(np.float32) if cv2.hasNonZero(clipped) else None
 
 
 @lru_cache(maxsize=128)

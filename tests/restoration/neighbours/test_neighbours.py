@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -112,6 +113,27 @@ def test_frames_restored_together_are_better_than_each_alone(simulated):
     assert joint.mean() > single.mean() + 0.5
     promised = [r.parameters["deblur"] for r in capture.restored(plan)]
     assert {bool(p["neighbours"]) == (p["neighbours_gain_db"] > 0) for p in promised} == {True}
+
+
+@pytest.mark.scenario
+def test_neighbours_help_beside_clipped_light_as_they_do_elsewhere(simulated):
+    """Around overexposed areas, beyond their streaks, frames gain 70 % of what they gain far from them."""
+    capture = simulated(effects=["gain_drift=" + ",".join(["1.6"] * SIZE["frames"])], bitrate_bits_per_px=3.0)
+    plan = capture.plan(PRESETS["balanced"])
+    alone = replace(plan, settings=replace(plan.settings, neighbours=0))
+    power = np.zeros((2, 2))
+    for joint, single in zip(capture.restored(plan), capture.restored(alone), strict=True):
+        truth = capture.truth(joint.frame.index).astype(float)
+        clipped = (truth.min(axis=2) >= 254).astype(np.uint8)
+        streaks, around = (cv2.dilate(clipped, np.ones((side, side), np.uint8)) > 0 for side in (25, 51))
+        x0, y0, x1, y1 = joint.valid_px
+        inside = np.zeros_like(streaks)
+        inside[y0 + 16 : y1 - 16, x0 + 16 : x1 - 16] = True
+        for place, pixels in enumerate((around & ~streaks & inside, ~around & inside)):
+            power[place] += [((one.picture - truth)[pixels] ** 2).sum() for one in (joint, single)]
+    near_db, far_db = 10 * np.log10(power[:, 1] / power[:, 0])
+    assert far_db > 1.0
+    assert near_db > 0.7 * far_db
 
 
 def test_a_frame_that_is_expected_to_lose_is_only_straightened(simulated, monkeypatch):

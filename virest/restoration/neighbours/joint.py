@@ -181,9 +181,10 @@ def register_neighbour(
     shift, noise_px, std_px = _shift_field(agreement, used)
     trust, alike = _trust(agreement, shift.at(agreement.centres_px), noise_px, independent_error)
     height, width = trust.shape
-    seen = (agreement.inside & ~agreement.clipped)[:height, :width]
+    inside = agreement.inside[:height, :width]
+    seen = inside & ~agreement.clipped[:height, :width]
     return NeighbourRegistration(
-        number, view, shift, agreement.gain, field, agreement.centres_px, trust * seen, alike * seen, seen, std_px,
+        number, view, shift, agreement.gain, field, agreement.centres_px, trust * inside, alike * seen, seen, std_px,
         agreement.shift_px, agreement.precision, view.apart_s(agreement.centres_px),
     )  # fmt: skip
 
