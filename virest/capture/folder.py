@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from virest.arrays import Array, Index, Mask
 from virest.capture import startup as start
 from virest.capture.detect import read_source
-from virest.capture.imu import ImuSamples
+from virest.capture.imu import ImuSamples, without_held_readings
 from virest.capture.join import (
     Alignment,
     align_frames,
@@ -115,6 +115,12 @@ def read_capture(path: Path, *, look_at_pictures: bool = True) -> Capture:
         notes.append(Note("warning", "clock-shift", remark))
     zero_ns = joined.stamp_0_ns + shift_ns
     imu = ImuSamples((files.gyro.time_ns - zero_ns) / 1e9, files.gyro.gyro_rad_s, files.gyro.accel_m_s2)
+    imu, held_rows = without_held_readings(imu)
+    if held_rows > 1:
+        text = (
+            f"{files.names.gyro} repeats each gyroscope reading in about {held_rows} rows: only its first row is used"
+        )
+        notes.append(Note("info", "gyro-held", text))
     gaps = find_gaps(imu.time_s)
     metadata = summarise(files, notes)
     time_s = (joined.stamps_ns + shift_ns - zero_ns) / 1e9

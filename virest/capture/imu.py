@@ -9,6 +9,13 @@ import numpy as np
 from virest.arrays import Array
 from virest.errors import ImuError
 
+LEAST_ROWS = 20
+"""Fewest rows in which runs of equal readings are looked for."""
+MOST_HELD, MOST_ALIKE = 12, 0.97
+"""Longest run of equal rows that polling makes, 500 Hz of rows over 40 Hz of readings; least fraction of the runs whose
+length is within one row of the median.  Runs of a reading that changes with a chance of its own are geometric: at most
+0.88 of them lie within one row of a median of 2, and 0.46 of one of 3."""
+
 
 @dataclass(frozen=True, slots=True)
 class ImuSamples:
@@ -34,6 +41,24 @@ class ImuSamples:
         first = max(int(np.searchsorted(self.time_s, start_s)) - margin_samples, 0)
         last = min(int(np.searchsorted(self.time_s, end_s)) + margin_samples, len(self.time_s))
         return ImuSamples(self.time_s[first:last], self.gyro_rad_s[first:last], self.accel_m_s2[first:last])
+
+
+def without_held_readings(imu: ImuSamples) -> tuple[ImuSamples, int]:
+    """The samples without rows that only repeat a gyroscope's reading, and in how many rows each reading stands.
+
+    Apps that poll a sensor faster than it measures log each reading several times.  The rates would be a staircase,
+    late by half a step on average.  Such runs of equal rows have one length; a gyroscope at rest, whose last digit
+    seldom changes, has runs of all lengths, and one that sticks has a few long ones.  A run's first row is kept.
+    Without such runs the samples are unchanged, and the number is 1.
+    """
+    if len(imu) < LEAST_ROWS:
+        return imu, 1
+    first = np.concatenate([[True], np.any(np.diff(imu.gyro_rad_s, axis=0) != 0, axis=1)])
+    lengths = np.diff(np.flatnonzero(np.append(first, True)))
+    rows = int(np.median(lengths))
+    if not 1 < rows <= MOST_HELD or np.mean(np.abs(lengths - rows) <= 1) < MOST_ALIKE:
+        return imu, 1
+    return ImuSamples(imu.time_s[first], imu.gyro_rad_s[first], imu.accel_m_s2[first]), rows
 
 
 def checked_samples(imu: ImuSamples) -> ImuSamples:
