@@ -29,7 +29,7 @@ def test_each_reading_keeps_its_first_row(rng: np.random.Generator, rows: int) -
 
 
 def test_other_logs_stay_as_they_are(rng: np.random.Generator) -> None:
-    """Readings of their own in each row, the coarse digits of a gyroscope at rest, one that sticks, one that is dead."""
+    """A reading per row, the coarse digits of a gyroscope at rest, one that sticks, one that is dead."""
     moving = rng.normal(size=(300, 3))
     resting = 0.01 * np.round(rng.normal(0, 0.004, (2000, 3)) / 0.01)
     sticking = moving.copy()
