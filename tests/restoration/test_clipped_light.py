@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from virest.image_formation.kernels import KernelField
-from virest.restoration.clipped_light import along_paths, unmeasured_masks
+from virest.image_formation.reach import along_paths
+from virest.restoration.clipped_light import unmeasured_masks
 
 WIDTH, HEIGHT, LENGTH = 160, 120, 12.0
 

@@ -15,6 +15,7 @@ from virest.camera.response import ResponseCurve
 from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import KernelSpread
 from virest.image_formation.kernels import KernelField
+from virest.image_formation.reach import around
 from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.statistics.records import LUMA_BLUE, LUMA_GREEN, LUMA_RED, PictureStatistics
 
@@ -127,12 +128,6 @@ def _clipped(channel: NDArray[np.uint8], curve: ResponseCurve) -> Image | None:
     pulled_down = cv2.LUT(channel[near], curve.clipped_table(PULLED_DOWN_LEVELS).astype(np.uint8))
     found[near] = cv2.dilate(clipped[near], np.ones((5, 5), np.uint8)) & pulled_down
     return found
-
-
-def around(mask: NDArray[np.uint8], reach: int) -> tuple[slice, slice]:
-    """Rows and columns of the bounding box of a mask (height, width), extended on each side by ``reach`` px."""
-    left, top, width, height = cv2.boundingRect(mask)
-    return slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
 
 
 def clipped_anywhere(picture: NDArray[np.uint8], curve: ResponseCurve) -> NDArray[np.uint8] | None:

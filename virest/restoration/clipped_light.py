@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import pairwise
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from virest.image_formation.blur import Image
-from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture, FieldMaker, around
+from virest.image_formation.reach import along_paths, around
+from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
 from virest.restoration.row_chunks import RowRenderer
 
 LEAST_MEASURED, ENOUGH_MEASURED, MEASURED_OVER_PX = 0.35, 0.65, 33
 """Fractions of the unclipped pixels with undisturbed light at which restoring begins and at which it has full weight;
 and side, px, of the neighbourhood, which is extended by the path on both sides."""
-
-PLACES = 4
-"""The picture is divided into this many parts each way, each with its own blur path."""
-TOUCHED = 2e-3
-"""Kernel values above this are on the path."""
 
 
 def near_clipped(blurred: BlurredPicture) -> Image | None:
@@ -90,32 +82,3 @@ def keep_unmeasured(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: Bl
         return levels
 
     return kept
-
-
-def along_paths(mask: NDArray[np.uint8], field: FieldMaker, operation: Callable[[Any, Any], Any]) -> NDArray[np.uint8]:
-    """A mask (height, width) dilated or eroded along the local blur path, in both directions.
-
-    Paths vary over a picture with row time and lens: each of PLACES × PLACES parts uses the path at its centre.  Parts
-    where the mask is constant, including a margin of the path's size, are unchanged, and so are pixels farther than two
-    such margins from the mask.
-    """
-    height, width = mask.shape
-    rows, columns = (np.linspace(0, length, PLACES + 1).astype(int) for length in (height, width))
-    parts = [
-        (slice(top, bottom), slice(left, right))
-        for top, bottom in pairwise(rows.tolist())
-        for left, right in pairwise(columns.tolist())
-    ]
-    middles = [[(c.start + c.stop - 1) / 2, (r.start + r.stop - 1) / 2] for r, c in parts]
-    paths = field(np.array(middles)).arrays(positive=True)
-    found, margin = mask.copy(), len(paths[0])
-    for (r, c), path in zip(parts, paths, strict=True):
-        top, left = max(r.start - margin, 0), max(c.start - margin, 0)
-        seen = mask[top : r.stop + margin, left : c.stop + margin]
-        if seen.size and seen.min() < seen.max():
-            reach = (path + path[::-1, ::-1] > TOUCHED).astype(np.uint8)
-            inner = slice(r.start - top, r.stop - top), slice(c.start - left, c.stop - left)
-            near, changed = around(seen, 2 * margin), np.zeros_like(seen)
-            changed[near] = operation(seen[near], reach)
-            found[r, c] = changed[inner]
-    return found

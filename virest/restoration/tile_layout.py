@@ -11,9 +11,9 @@ import numpy as np
 
 from virest.arrays import Array
 from virest.image_formation.blur import Image
+from virest.image_formation.reach import along_paths
 from virest.restoration import tiles
 from virest.restoration.blurred import CODEC_REACH_PX, BlurredPicture
-from virest.restoration.clipped_light import along_paths
 from virest.restoration.neighbours.joint import NeighbourPicture
 from virest.restoration.neighbours.registration import CLIPPED_LIGHT
 from virest.restoration.settings import RestorationSettings

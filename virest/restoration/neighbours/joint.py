@@ -46,6 +46,8 @@ than a sixth of what chessboard edges do.  Chosen on relief at 1 and 0.7 m, two 
 loses 0.1 dB on these."""
 AROUND, CLOSE_BY = 17, 7
 """Sides, reduced pixels, of the squares for local power: at the size of objects, and of their rims."""
+LEAST_COUNTED = 0.1
+"""Least part of such a square that must count for its power to be known."""
 LEAST_ALIKE = 0.5
 """Least mean ``alike`` for a neighbour to be used to detect motion."""
 SPARSE = 4
@@ -238,7 +240,8 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
     """
     tiles = agreement.differences(shift_px)
     different, shown = agreement.side_by_side(tiles), agreement.side_by_side(agreement.shown())
-    left, both = (_power_around(one, AROUND) for one in (different, shown))
+    unclipped = np.float32(~agreement.clipped[: len(different), : different.shape[1]])
+    left, both = (_power_around(one, AROUND, unclipped) for one in (different, shown))
     some = np.s_[::SPARSE, ::SPARSE]
     if np.median(left[some] / (OWN_ERROR * both[some] + np.float32(independent_error))) > MOST_DIFFERENT:
         return np.zeros_like(left), np.zeros_like(left)
@@ -247,13 +250,13 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
     alike = _relative_noise(left, MOVING * expected)
     off_px = np.where(agreement.precision[:, None] > 0, agreement.shift_px - shift_px, 0.0)
     sure = np.maximum(1 - 2 * noise_px**2 / np.maximum((off_px**2).sum(axis=1), 1e-12), 0.0)
-    near, shown_near = (_power_around(one, CLOSE_BY) for one in (different, shown))
+    near, shown_near = (_power_around(one, CLOSE_BY, unclipped) for one in (different, shown))
     relief_px = agreement.over_picture(agreement.wholly_seen * sure * np.linalg.norm(off_px, axis=1))
     ordinary = MOVING / (1 + (relief_px / np.float32(RIM_PX)) ** 2)
     trust = _relative_noise(near, cv2.max(ordinary, 1.0) * (OWN_ERROR * shown_near + noise))
     own = np.flatnonzero(sure)
     tiles[own] = agreement.differences(shift_px[own] + sure[own, None] * off_px[own], own)
-    misplaced = left - _power_around(agreement.side_by_side(tiles), AROUND)
+    misplaced = left - _power_around(agreement.side_by_side(tiles), AROUND, unclipped)
     trust *= expected / (expected + 2 * cv2.max(misplaced, 0.0))
     return _thresholded(trust), _thresholded(alike)
 
@@ -267,9 +270,20 @@ def _thresholded(trust: Image) -> Image:
     return cv2.threshold(trust, LEAST_TRUST, 0.0, cv2.THRESH_TOZERO)[1]
 
 
-def _power_around(picture: Image, side: int) -> Image:
-    """Mean square over the ``side`` × ``side`` square around each pixel."""
-    return cv2.sqrBoxFilter(picture, cv2.CV_32F, (side, side))
+def _power_around(picture: Image, side: int, weight: Image) -> Image:
+    """Mean square over the ``side`` × ``side`` square around each pixel; weight: 0 for pixels that do not count.
+
+    Where none counts it is that of the nearest squares in which some do.
+    """
+    power = cv2.sqrBoxFilter(picture * weight, cv2.CV_32F, (side, side))
+    counted = cv2.blur(weight, (side, side))
+    missing = counted < LEAST_COUNTED
+    found = power / cv2.max(counted, LEAST_COUNTED)
+    while missing.any() and not missing.all():
+        power, counted = (cv2.blur(one, (side, side)) for one in (power, counted))
+        np.divide(power, counted, out=found, where=missing & (counted >= LEAST_COUNTED))
+        missing &= counted < LEAST_COUNTED
+    return found
 
 
 def static_part(found: Sequence[NeighbourRegistration]) -> Image | None:

@@ -134,16 +134,17 @@ def read_at(picture: Image, source: NDArray[np.float32]) -> Image:
     return cv2.remap(picture, source, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
-def spectra_of(tiles: Image, seen: Image | None = None) -> NDArray[np.complex64]:
+def spectra_of(tiles: Image, seen: Image | None = None, *, masked: bool = False) -> NDArray[np.complex64]:
     """Spectra (n, TILE, TILE / 2 + 1) of tiles under a Hann window, divided by their mean, minus 1.
 
-    The division removes brightness changes.  seen: (n, TILE, TILE) weights for the mean; None: all 1.
+    The division removes brightness changes.  seen: (n, TILE, TILE) weights for the mean; None: all 1.  masked: weigh
+    the deviations from the mean by them too.
     """
     window = _window()
     weight = np.broadcast_to(window, tiles.shape) if seen is None else window * seen
     total = np.maximum(weight.sum(axis=(1, 2)), 1e-6)
     means = (np.einsum("nij,nij->n", tiles, weight) / total)[:, None, None]
-    return np.asarray(fft.rfft2((tiles / np.maximum(means, 1e-3) - 1) * window))
+    return np.asarray(fft.rfft2((tiles / np.maximum(means, 1e-3) - 1) * (weight if masked else window)))
 
 
 @lru_cache(maxsize=1)

@@ -19,6 +19,7 @@ from virest.camera.profile import CameraProfile
 from virest.image_formation.blur import Image
 from virest.image_formation.kernels import KernelField, smooth_field
 from virest.image_formation.neighbour import NeighbourView, turn_jacobian_px
+from virest.image_formation.reach import along_paths
 from virest.restoration.neighbours.reduced_tiles import (
     MOST_TILES,
     TILE,
@@ -45,6 +46,9 @@ FAR_PX = 3.0
 """Compensate a larger common shift, reduced pixels, before the fits, so that tiles show the same content."""
 CLIPPED_LIGHT = 0.95
 """Brighter pixels are not compared: clipped light cannot be blurred again."""
+RIM_PX, SOFT_PX = 1, 3
+"""Reduced pixels around clipped light that the codec and the resampling change; width of the edges of what is
+compared."""
 LEAST_SEEN = 0.5
 """Least fraction of a tile that must be comparable."""
 HUBER = 1.5
@@ -90,6 +94,8 @@ class FrameTiles:
     """(n, WIDE, WIDE / 2 + 1) spectra of the tiles' light with margins."""
     kernels: NDArray[np.complex64]
     """(n, WIDE, WIDE / 2 + 1) spectra of the transposed kernels."""
+    field: Callable[[Array], KernelField]
+    """The kernels at given centres in the recorded picture."""
 
     @property
     def centres_px(self) -> Array:
@@ -111,7 +117,7 @@ def frame_tiles(
         return None
     tiles = cut(light, tops_lefts)
     wide = wide_spectra(light, tops_lefts)
-    return FrameTiles(tops_lefts, times, light, tiles.mean(axis=(1, 2)), wide, kernels)
+    return FrameTiles(tops_lefts, times, light, tiles.mean(axis=(1, 2)), wide, kernels, field)
 
 
 def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | None:
@@ -123,13 +129,16 @@ def pair_turn(view: NeighbourView, first: Image, second: Image) -> PairTurn | No
     if tiles is None:
         return None
     tops_lefts, times = tiles.tops_lefts, tiles.times
-    there = kernel_spectra(view.field(), tops_lefts, times)
+    field = view.field()
+    there = kernel_spectra(field, tops_lefts, times)
     if there is None:
         return None
-    a, apart = spectra_of(inner(tiles.spectra * there)), np.zeros(2)
+    blurred, apart = inner(tiles.spectra * there), np.zeros(2)
     for _ in range(2):
-        b = wide_spectra(_registered(view, second, times, apart), tops_lefts)
-        b = spectra_of(inner(b * tiles.kernels))
+        registered = _registered(view, second, times, apart)
+        seen = _comparable(_reached_by_clipped_light(tiles, registered, field), tops_lefts)
+        beside = inner(wide_spectra(registered, tops_lefts) * tiles.kernels)
+        a, b = (spectra_of(tile, seen, masked=True) for tile in (blurred, beside))
         common = common_shift(a, b)
         if np.abs(common).max() <= FAR_PX:
             break
@@ -230,7 +239,9 @@ def tile_agreement(
     there = read_at(second, source)
     wide, blur_px = tiles.spectra * kernels, min(_reach_px(field, tiles.tops_lefts, tiles.times), TILE // 4)
     here, there_blurred = inner(wide), inner(wide_spectra(there, tiles.tops_lefts) * tiles.kernels)
-    a, b = spectra_of(here), spectra_of(there_blurred)
+    clipped = _reached_by_clipped_light(tiles, there, field)
+    seen = _comparable(clipped, tiles.tops_lefts)
+    a, b = (spectra_of(tile, seen, masked=True) for tile in (here, there_blurred))
     shift, precision = tile_shifts(a, b, np.zeros(2))
     per_mean = [1 / np.maximum(tile.mean(axis=(1, 2), keepdims=True), 1e-3) for tile in (here, there_blurred)]
     return TileAgreement(
@@ -243,7 +254,7 @@ def tile_agreement(
         float(np.median(cut(there, tiles.tops_lefts).mean(axis=(1, 2)) / np.maximum(tiles.means, 1e-6))),
         float(np.median(tiles.means)),
         _inside(source, second),
-        _near_clipped_light(tiles.light, there, blur_px) > 0,
+        clipped,
         blur_px,
         np.asarray(power_of(tiles.kernels).mean(axis=0) + power_of(kernels).mean(axis=0)),
         tiles.times,
@@ -308,6 +319,25 @@ def _inside(source: NDArray[np.float32], second: Image) -> Mask:
     """Where a map (h, w, 2) points inside the neighbour's picture."""
     height, width = second.shape
     return np.asarray(cv2.inRange(source, (-0.5, -0.5), (width - 0.5, height - 0.5)) > 0)
+
+
+def _reached_by_clipped_light(tiles: FrameTiles, there: Image, field: Callable[[Array], KernelField]) -> Mask:
+    """Where clipped light of a frame, blurred along its neighbour's paths, may reach, and the neighbour's, vice versa.
+
+    there: the registered neighbour, reduced.
+    """
+    reached = np.zeros(there.shape, np.uint8)
+    for light, paths in ((tiles.light, field), (there, tiles.field)):
+        mask = (light > CLIPPED_LIGHT).astype(np.uint8)
+        if cv2.hasNonZero(mask):
+            reached |= along_paths(mask, paths, cv2.dilate, tiles.times)
+    rim = np.ones((2 * RIM_PX + 1, 2 * RIM_PX + 1), np.uint8)
+    return np.asarray(cv2.dilate(reached, rim) > 0)
+
+
+def _comparable(clipped: Mask, tops_lefts: Index) -> Image | None:
+    """Weights (n, TILE, TILE) of tiles' pixels, 0 where clipped light may reach, with soft edges; None: all 1."""
+    return cut(cv2.blur(np.float32(~clipped), (SOFT_PX, SOFT_PX)), tops_lefts) if clipped.any() else None
 
 
 def _near_clipped_light(light: Image, there: Image, reach_px: int, beyond: int = 0) -> NDArray[np.uint8]:
