@@ -30,7 +30,7 @@ from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.settings import PRESETS
 from virest.restoration.statistics import of_picture, ring_fit
 from virest.restoration.statistics.records import Misplaced
-from virest.restoration.taken_part import LEAST_CONFIRMED_DB
+from virest.restoration.taken_part import CERTAIN_GAIN_DB
 
 Row = dict[str, Any]
 OTHER_SEEDS = 1000
@@ -122,7 +122,7 @@ def best_value(values: Sequence[float], gains_db: Array) -> Row:
 class _RecordingGain(ConfirmedGain):
     """A ConfirmedGain that records the arguments of its calls, and promises every frame enough to be deblurred.
 
-    A fit to the frames whose prediction was high enough would follow the prediction.
+    A fit to the frames whose prediction was high enough would follow the prediction.  All of the change is taken.
     """
 
     asked: list[tuple[float, float, float, float, float, Misplaced, tuple[float, float]]] = field(default_factory=list)
@@ -138,7 +138,7 @@ class _RecordingGain(ConfirmedGain):
         colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
         self.asked.append((changed, lost, ideal, power, coded, misplaced, colour))
-        return LEAST_CONFIRMED_DB, 0.0
+        return CERTAIN_GAIN_DB, 0.0
 
 
 def _opened(work: Path, workload: Workload) -> TrueCapture:

@@ -240,7 +240,7 @@ def _trust(agreement: TileAgreement, shift_px: Array, noise_px: float, independe
     """
     tiles = agreement.differences(shift_px)
     different, shown = agreement.side_by_side(tiles), agreement.side_by_side(agreement.shown())
-    unclipped = np.float32(~agreement.clipped[: len(different), : different.shape[1]])
+    unclipped = (~agreement.clipped[: len(different), : different.shape[1]]).astype(np.float32)
     left, both = (_power_around(one, AROUND, unclipped) for one in (different, shown))
     some = np.s_[::SPARSE, ::SPARSE]
     if np.median(left[some] / (OWN_ERROR * both[some] + np.float32(independent_error))) > MOST_DIFFERENT:
