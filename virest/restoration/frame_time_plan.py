@@ -31,7 +31,7 @@ POINTS_PER_PAIR = 60
 ROWS_LATE = (1, -1, 2, -2)
 """Rows by which a table of exposures may lag (+) or lead (−) the movie."""
 MOST_FRAMES = 3000
-"""Most frames of a movie that are tracked for delays of their own: a minute or two of 640×480."""
+"""Frames of a movie that are tracked for delays of their own, the first ones: 3000 of 640×480 take 20 s."""
 SOURCE = "tracked points against the gyroscope, frame by frame"
 
 
@@ -100,16 +100,17 @@ def find_frame_times(
         text = f"exposure times are logged {frames}: each frame is restored with its own"
         return FrameTimes(replace(capture, frames=with_own_exposures(capture.frames, rows)), given, rows, text)
     usable = [frame for frame in capture.frames if frame.skip_reason is None]
-    if len(usable) > MOST_FRAMES:
-        return None
-    if {frame.index for frame in usable} - {n for pair in pairs for n in (pair.first, pair.second)}:
-        more = _turns(capture, track_all([frame.index for frame in usable]), profile)
+    wanted = [frame.index for frame in usable[:MOST_FRAMES]]
+    if set(wanted) - {n for pair in pairs for n in (pair.first, pair.second)}:
+        more = _turns(capture, track_all(wanted), profile)
         found = (fit_frame_delays(more) if more is not None else None) or found
     text = (
         f"stamps differ from frame to frame by {1e3 * found.jitter_s:.1f} ms (rms) from the times that points show, "
         "which are used instead"
     )
-    return FrameTimes(capture, _with_delays(given, profile, capture, usable, found), 0, text)
+    text += f" in the first {MOST_FRAMES} frames" if len(usable) > MOST_FRAMES else ""
+    # a frame more, which has no delay, since beyond its last knot a field is constant
+    return FrameTimes(capture, _with_delays(given, profile, capture, usable[: MOST_FRAMES + 1], found), 0, text)
 
 
 def has_frame_delays(profile: CameraProfile) -> bool:
