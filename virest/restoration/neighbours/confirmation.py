@@ -37,7 +37,7 @@ The coder's error counts beyond its noise: a coder drops the faint detail of a b
 other frames, so what is left there is not the blurred picture.
 
 Each predicts the error only to a factor.  ``python -m virest.app.bench --only fits`` fits the coefficients to pictures
-with ground truth: 1.54 ± 0.48, 0.75 ± 0.09, 0.08 ± 0.15, 0.36 ± 0.12, 0.72 ± 0.54 on 22 captures, median error 0.52 dB.
+with ground truth: 1.50 ± 0.47, 0.74 ± 0.11, 0.13 ± 0.14, 0.29 ± 0.13, 0.63 ± 0.41 on 22 captures, median error 0.51 dB.
 These are fitted to 36 captures of a second simulator too, and differ by at most 1.3 deviations."""
 LEFT_OVER_STD = 0.61
 """Standard deviation of that logarithm, from the same 58 captures."""
