@@ -92,3 +92,21 @@ def test_too_few_pairs_say_nothing(rng: np.random.Generator) -> None:
     assert fit_frame_delays(turns_of(rng, np.zeros(6))) is None
     turns = turns_of(rng, np.zeros(30))
     assert fit_frame_delays(replace(turns, second=turns.first + 5)) is None
+
+
+def test_points_that_tell_nothing_end_in_no_delays(rng: np.random.Generator) -> None:
+    """Neither a camera at rest nor large errors of other kinds end in an error."""
+    still = turns_of(rng, np.zeros(30))
+    nothing = {"per_first_s": 0 * still.per_first_s, "per_second_s": 0 * still.per_second_s}
+    wild = rng.normal(0, 0.05, still.left_rad.shape)
+    for turns in (
+        replace(still, **nothing),
+        replace(still, left_rad=0 * still.left_rad),
+        replace(still, left_rad=np.cumsum(wild, axis=0)),
+        replace(still, left_rad=wild, **nothing),
+    ):
+        found = fit_frame_delays(turns)
+        assert found is not None
+        assert found.p > 1e-3
+        assert np.isfinite(found.late_s).all()
+        assert np.isfinite(found.std_s).all()

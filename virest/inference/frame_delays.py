@@ -35,7 +35,9 @@ SLOPE_STEP_S = 1e-4
 TURN_STEP_RAD = 1e-5
 """Step of the difference quotients over a rotation."""
 WIDE = 1e3
-"""Prior standard deviation of the slow errors at the start, in units of the noise: they are open there."""
+"""Prior standard deviation of what is open: slow errors at the start, in units of the noise, and the clock's, ms."""
+LEAST_INFORMATION = 1e-9
+"""Least information about a rotation, of that about all: points in a small part of the picture do not show one."""
 MOST_GAP = 2
 """Most frames from one of a pair to the other."""
 MIN_PAIRS = 8
@@ -44,8 +46,9 @@ UNIT_S = 1e-3
 """Unit of the delays within the fit."""
 START = np.array([0.0, -1.0, 0.0])
 """Logarithms of the sizes to start from: noise as the points', a third of it per step, delays of UNIT_S."""
-LEAST = -12.0
-"""Logarithm of sizes that are taken for 0, and minus the largest."""
+LEAST, LEAST_NOISE, MOST = -12.0, float(np.log(0.5)), 7.0
+"""Logarithms of sizes that are taken for 0, of the least noise, and of the largest size.  The points' noise is measured
+pair by pair without a model; where slow errors are large, these would replace it."""
 LOWER, COLUMNS = 4 * MOST_GAP + 3, 256
 """Diagonals below the main one; columns of the inverse that are computed at a time."""
 
@@ -195,10 +198,10 @@ class _System:
         simplex = start + np.eye(len(start) + 1, len(start))
         options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.01}
         found = minimize(self._cost, start, method="Nelder-Mead", options=options)
-        return np.asarray(found.x), float(found.fun)
+        return _bounded(found.x)[: len(start)], float(found.fun)
 
     def _information(self, sizes: Array) -> Array:
-        noise, step, delay = np.exp(2 * np.asarray(sizes))
+        noise, step, delay = np.exp(2 * sizes)
         return np.asarray(self.turns / noise + self.delays_alone / delay + self.walk / step + self.opened)
 
     def _solved(self, sizes: Array) -> tuple[tuple[Array, bool], Array, Array, Array]:
@@ -207,11 +210,12 @@ class _System:
         both = np.column_stack([self.common, self.pull]) / noise
         solved = cho_solve_banded(factor, both)
         left = self.of_common / noise - both[:, :2].T @ solved
+        left[:, :2] += WIDE**-2 * np.eye(2)  # a camera at rest says nothing about its clock
         return factor, solved, left[:, :2], np.linalg.solve(left[:, :2], left[:, 2])
 
     def _cost(self, sizes: Array) -> float:
         """Negative logarithm of the likelihood, up to a constant."""
-        noise, step, delay = sizes = np.clip([*sizes, LEAST][:3], LEAST, -LEAST)
+        noise, step, delay = sizes = _bounded(sizes)
         (factor, _), solved, information, clock = self._solved(sizes)
         explained = float(self.pull @ solved[:, 2]) / np.exp(2 * noise) + float(clock @ information @ clock)
         spread = 2 * (self.counts[0] * noise + self.counts[1] * step + len(self.frame) * delay)
@@ -231,6 +235,11 @@ class _System:
         return np.asarray(UNIT_S * late, float), np.asarray(UNIT_S * np.sqrt(variance), float)
 
 
+def _bounded(sizes: Array) -> Array:
+    """The logarithms (3,) of the sizes within their bounds; missing delays have none."""
+    return np.clip([*sizes, LEAST][:3], (LEAST_NOISE, LEAST, LEAST), MOST)
+
+
 def _clock(place: Index, count: int) -> Array:
     """Delays (n, 1, 2) of frames by an offset and by a drift of the clock, of UNIT_S at most."""
     return np.stack([np.ones(len(place)), 2 * place / max(count - 1, 1) - 1], axis=-1)[:, None]
@@ -248,6 +257,8 @@ def _turns_of(table: TrackTable, per_turn: Array, moved: Array, weight: Array) -
     information, pull = np.zeros((table.n_pairs, 3, 3)), np.zeros((table.n_pairs, 3))
     np.add.at(information, table.pair, np.einsum("nij,nik,n->njk", per_turn, per_turn, weight))
     np.add.at(pull, table.pair, np.einsum("nij,ni,n->nj", per_turn, moved, weight))
+    size = information.trace(axis1=1, axis2=2)[:, None, None]
+    information += LEAST_INFORMATION * np.maximum(size, np.finfo(float).tiny) * np.eye(3)
     return np.asarray(np.linalg.solve(information, pull[..., None])[..., 0], float), information
 
 
