@@ -10,7 +10,7 @@ import pytest
 
 from virest.image_formation.kernels import KernelField
 from virest.image_formation.reach import along_paths
-from virest.restoration.clipped_light import unmeasured_masks
+from virest.restoration.clipped_light import keep_unmeasured, unmeasured_masks
 
 WIDTH, HEIGHT, LENGTH = 160, 120, 12.0
 
@@ -59,3 +59,18 @@ def test_a_single_clipped_pixel_is_not_kept_as_recorded() -> None:
     assert unmeasured_masks(blurred) == [None] * 3  # type: ignore[arg-type]
     clipped[40:80, 20:60] = 1.0
     assert unmeasured_masks(blurred)[0] is not None  # type: ignore[arg-type]
+
+
+def test_nothing_beside_clipped_light_becomes_darker_than_its_surroundings() -> None:
+    """Dark beads on the rim of a highlight are raised to the darkest level around; far from it they stay."""
+    recorded = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    recorded[50:60, 30:50] = 255
+    holes = (recorded[..., 0] == 255).astype(np.float32)
+    blurred = SimpleNamespace(
+        field=field, light=[holes] * 3, dark=[None] * 3, clipped=[holes] * 3, holes=holes, longest_px=LENGTH
+    )
+    sharp = recorded.astype(np.float32)
+    sharp[55, 54:58] = sharp[100, 54:58] = 10.0
+    kept = keep_unmeasured(lambda rows: sharp[rows].copy(), recorded, blurred)(slice(0, HEIGHT))  # type: ignore[arg-type]
+    assert kept[55, 54:58].min() == 90
+    assert kept[100, 54:58].max() == 10

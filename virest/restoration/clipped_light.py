@@ -53,6 +53,24 @@ def measured_share(blurred: BlurredPicture) -> Image | None:
     return cv2.blur(np.clip(share, 0, 1), (side, side))
 
 
+def _floor(recorded: NDArray[np.uint8], blurred: BlurredPicture) -> NDArray[np.uint8] | None:
+    """Lowest restored levels (height, width, 3): beside clipped light, the lowest recorded ones a path's length around.
+
+    How bright a highlight is, its rim does not say well enough for what lies beside it: errors that darken it show as
+    a row of beads.  None: nothing is clipped.
+    """
+    holes = blurred.holes
+    if holes is None:
+        return None
+    rim = np.ones((2 * int(np.ceil(CODEC_REACH_PX)) + 1,) * 2, np.uint8)
+    beside = cv2.dilate(along_paths(holes.astype(np.uint8), blurred.field, cv2.dilate), rim)
+    side = 2 * int(np.ceil(blurred.longest_px + CODEC_REACH_PX)) + 1
+    near = around(beside, side)
+    floor = np.zeros_like(recorded)
+    floor[near] = cv2.erode(recorded[near], np.ones((side, side), np.uint8)) * beside[near][..., None]
+    return floor
+
+
 def unmeasured_masks(blurred: BlurredPicture) -> list[NDArray[np.uint8] | None]:
     """1 where a channel is dark, or clipped, all along the blur path around a pixel; None per channel: nowhere."""
     if all(mask is None for mask in (*blurred.dark, *blurred.clipped)):
@@ -70,12 +88,14 @@ def keep_unmeasured(sharp: RowRenderer, recorded: NDArray[np.uint8], blurred: Bl
 
     These include levels beyond the curve's ends, from noise and the codec, that no light would give.
     """
-    masks = unmeasured_masks(blurred)
-    if all(mask is None for mask in masks):
+    masks, floor = unmeasured_masks(blurred), _floor(recorded, blurred)
+    if floor is None and all(mask is None for mask in masks):
         return sharp
 
     def kept(rows: slice) -> Image:
         levels = sharp(rows)
+        if floor is not None:
+            np.maximum(levels, floor[rows], out=levels)
         for channel, unseen in enumerate(masks):
             if unseen is not None and cv2.hasNonZero(unseen[rows]):
                 np.copyto(levels[..., channel], recorded[rows, :, channel], where=unseen[rows] > 0)
