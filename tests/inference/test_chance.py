@@ -21,12 +21,6 @@ def test_tails_and_quantiles_are_those_of_the_distributions(rng: np.random.Gener
         assert chance.chance_of_larger(first, second) == pytest.approx(expected, rel=1e-9)
 
 
-def test_the_sign_test_counts_positive_values() -> None:
-    """The p value is the probability of at least as many positive values if half are expected."""
-    assert chance.sign_tail(np.r_[np.ones(30), -np.ones(5)]) == pytest.approx(stats.binom.sf(29, 35, 0.5), rel=1e-9)
-    assert chance.sign_tail(-np.ones(5)) == 1.0
-
-
 def test_an_empty_group_has_no_larger_mean() -> None:
     """The probability is NaN if either group is empty."""
     assert np.isnan(chance.chance_of_larger(np.zeros(0), np.ones(4)))

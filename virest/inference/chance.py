@@ -76,12 +76,6 @@ def chance_of_larger(first: Array, second: Array) -> float:
     return student_tail((first.mean() - second.mean()) / max(error, np.finfo(float).tiny), freedom)
 
 
-def sign_tail(values: Array) -> float:
-    """One-sided p value of a sign test that more than half of values (n,) are positive."""
-    positive = int(np.count_nonzero(values > 0))
-    return float(special.bdtrc(positive - 1, len(values), 0.5)) if positive else 1.0
-
-
 def beyond_noise(gain: Array) -> float:
     """Sum of gains (blocks,) over its standard deviation without any gain, from the robust scatter of the blocks.
 

@@ -163,10 +163,6 @@ class FieldForm:
             per_value[rows, :, end] = moved
         return np.asarray(per_value @ self.basis)
 
-    def moved_by_second(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> Array:
-        """Slopes (n, 2) of the points per delay of their second frame, for a form with a knot for each frame."""
-        return self._moved_by_ends(profile, table, moved_by)[1][1]
-
     def _moved_by_ends(self, profile: CameraProfile, table: TrackTable, moved_by: Moved) -> list[tuple[Index, Array]]:
         """For the first and the second frames of the points: their knots (n,), and the slopes (n, 2) per delay of each.
 

@@ -18,7 +18,6 @@ from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals, point_residuals
 from virest.diagnosis.field.form_list import FRAMES_PER_STEP, form_of_late_frames, forms_of_pairs, possible_forms
 from virest.diagnosis.field.forms import OVER, STD, FieldForm
-from virest.diagnosis.field.late_frames import late_frames_p
 from virest.diagnosis.field.levels import given_value_p, level_cause
 from virest.diagnosis.field.records import FittedField
 from virest.diagnosis.field.screening import (
@@ -49,6 +48,7 @@ from virest.diagnosis.geometric_ladder import (
 from virest.diagnosis.selection import POINT_LEVELS
 from virest.diagnosis.structure import STRUCTURE_NOISES
 from virest.inference.chance import beyond_noise, t_ratio
+from virest.inference.frame_delays import fit_frame_delays, unexplained_turns
 from virest.inference.track_fit import Term, TrackFit, fit_from
 
 log = logging.getLogger(__name__)
@@ -339,7 +339,8 @@ def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     close = [] if selection is None else [_Proposal(forms[selection.best.index], selection)]
     late = form_of_late_frames(capture, fitted.profile, span_s, frozenset(in_model))
     if late is not None and late.family not in in_model:
-        p_value = min(late_frames_p(seen, late) * search.forms_tested, 1.0)
+        found = fit_frame_delays(unexplained_turns(seen.imu, seen.table, seen.fit.profile))
+        p_value = 1.0 if found is None else min(found.p * search.forms_tested, 1.0)
         log.debug("%s by frame: p %.2g", late.name, p_value)
         close += [_Proposal(late, jitter_p=p_value)] if p_value < MAX_P else []
     if close:
