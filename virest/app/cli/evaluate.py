@@ -63,7 +63,7 @@ def shutter(
     schubert2018         0.3409  0.4457  1.7406      0.3798     200
     perspective          0.5059  0.6177  1.2699      0.5605     200
     rowwise-rotation     0.2372  0.3979  1.0131      0.2637     200
-    rowwise              0.0092  0.0115  0.0348      0.0102     200
+    rowwise              0.0091  0.0114  0.0348      0.0101     200
     ...
     $ virest simulate wall --scene board --rate 2 --exposure-ms 1
     $ virest evaluate shutter wall --json | jq .all.methods.rowwise.outer
