@@ -106,7 +106,8 @@ def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], profile:
         left_s = found_s - np.mean(found_s) - factor * expected_s
         if np.var(left_s) < (1 - RIVAL_GAIN_FRACTION) * np.var(found_s) and abs(factor - 1) < FROM_ONE:
             rival = f"exposure times logged {_apart(rows)}"
-            sentence = f"{finding.sentence}; {rival} would explain it: compare the table with the movie"
+            remedy = f"with exposures_late_frames: {rows} in the profile's extensions, each frame is given its own"
+            sentence = f"{finding.sentence}; {rival} would explain it ({remedy})"
             return replace(finding, confounded=(*finding.confounded, rival), sentence=sentence)
     return finding
 
