@@ -17,10 +17,11 @@ from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_decodable_gray
 from virest.image_formation.row_clock import RowClock
-from virest.restoration.capture import RestorationPlan, with_own_exposures
+from virest.restoration.capture import RestorationPlan, at_true_times, with_own_exposures
 from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.plan_notes import NoteCode
 from virest.restoration.settings import PRESETS
+from virest.simulation.session import nominal_camera
 
 Film = Callable[[Capture], RestorationPlan]
 FRAMES = 40
@@ -105,6 +106,18 @@ def test_a_profile_that_delays_frames_already_is_taken_as_it_is(capture: Capture
     found = planned(shaken)
     given = resolve_profile(capture)[0].with_fields(found.profile.fields)
     assert not said(planned(shaken, given))
+
+
+def test_simulate_logs_exposures_as_late_as_the_profile_says(tmp_path: Path) -> None:
+    """Row k holds the exposure of frame k − 2, and reading it with that profile gives each frame its own."""
+    exposures_ms = [3.0, 12.0, 6.0, 18.0, 9.0]
+    camera = nominal_camera(64, 48).with_extensions(exposures_late_frames=2)
+    simulate_command(tmp_path / "late", frames=10, profile=camera, exposure_ms=exposures_ms, rate_rad_s=0.5, seed=3)
+    late = read_capture(tmp_path / "late")
+    logged_ms = [1e3 * (frame.exposure_s or 0.0) for frame in late.frames]
+    np.testing.assert_allclose(logged_ms[2:], (2 * exposures_ms)[:8])
+    own = at_true_times(late.frames, resolve_profile(late)[0])
+    np.testing.assert_allclose([1e3 * (frame.exposure_s or 0.0) for frame in own[:8]], (2 * exposures_ms)[:8])
 
 
 def test_the_file_of_a_profile_keeps_the_rows(tmp_path: Path, capture: Capture) -> None:
