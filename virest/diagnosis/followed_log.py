@@ -30,11 +30,10 @@ from virest.diagnosis.photometry_fit import fit_photometry, judge
 from virest.diagnosis.picture_ladder import PictureVerdict
 from virest.image_formation.row_clock import RowClock
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.restoration.frame_time_plan import ROWS_LATE, rows_apart
 
 KNOTS = 5
 """Most knots of a curve over a logged quantity: a cubic spline through 5 follows one period to 10 % (rms)."""
-FRAMES_OFF = (1, -1, 2, -2)
-"""Rows by which a recorder's table of exposures may lag (+) or lead (−) the movie."""
 FROM_ONE = 0.25
 """Largest difference from 1 of the factor by which gains follow another frame's exposure × ISO: half way to the factor
 of an encoder that is late by half a frame (DELAY_FRAMES)."""
@@ -65,7 +64,7 @@ class Form:
     def rival(self) -> str:
         """Its name among the rivals."""
         if self.frames_off:
-            return f"exposure and ISO logged {_apart(self.frames_off)}"
+            return f"exposure and ISO logged {rows_apart(self.frames_off)}"
         return f"gain over {LOGGED[self.name]}"
 
 
@@ -76,11 +75,6 @@ class _Followed:
     form: Form
     shape: str
     held_out: HeldOutGain
-
-
-def _apart(frames_off: int) -> str:
-    count, way = abs(frames_off), "late" if frames_off > 0 else "early"
-    return f"{count} frame{'s' * (count > 1)} {way}"
 
 
 def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], profile: CameraProfile) -> FieldFinding:
@@ -96,7 +90,7 @@ def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], profile:
     start_s = np.array([clock.start_on_camera_s(frame.time_s, frame.exposure_s or 0.0) for frame in frames])
     seen = (start_s >= late.knots[0][0]) & (start_s <= late.knots[0][-1])
     found_s = late.at_time(start_s[seen])[:, 0]
-    for rows in FRAMES_OFF:
+    for rows in ROWS_LATE:
         moved = np.clip(np.arange(len(frames)) + rows, 0, len(frames) - 1)
         other_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(exposure_s[moved] - exposure_s)
         expected_s = other_s[seen] - np.mean(other_s[seen])
@@ -105,7 +99,7 @@ def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], profile:
         factor = float(expected_s @ found_s / (expected_s @ expected_s))
         left_s = found_s - np.mean(found_s) - factor * expected_s
         if np.var(left_s) < (1 - RIVAL_GAIN_FRACTION) * np.var(found_s) and abs(factor - 1) < FROM_ONE:
-            rival = f"exposure times logged {_apart(rows)}"
+            rival = f"exposure times logged {rows_apart(rows)}"
             remedy = f"with exposures_late_frames: {rows} in the profile's extensions, each frame is given its own"
             sentence = f"{finding.sentence}; {rival} would explain it ({remedy})"
             return replace(finding, confounded=(*finding.confounded, rival), sentence=sentence)
@@ -185,7 +179,7 @@ def possible_forms(frames: Sequence[Frame], seen: Index) -> Iterator[Form]:
     light = np.log(exposure_s * iso)
     if not np.isfinite(light).all() or not np.ptp(light):
         return
-    for rows in FRAMES_OFF:
+    for rows in ROWS_LATE:
         moved = np.clip(np.arange(len(light)) + rows, 0, len(light) - 1)
         yield Form("", (light[moved] - light)[:, None], frames_off=rows)
 

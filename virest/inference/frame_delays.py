@@ -140,15 +140,15 @@ class _System:
     frame: Index
     """(n,) movie index of each frame."""
     turns: Array
-    """Of the turns, for noise of size 1."""
+    """Information that the turns give at unit noise."""
     pull: Array
-    """(4 n,) right-hand side of the same."""
+    """(4 n,) right-hand side of the normal equations at unit noise."""
     delays_alone: Array
-    """Of delays of size 1."""
+    """Prior information of delays of unit size."""
     walk: Array
-    """Of steps of the slow errors of size 1."""
+    """Prior information of slow errors whose steps have unit size."""
     opened: Array
-    """Of the slow errors' start in each run of frames."""
+    """Prior information of the slow errors at the start of each run of frames."""
     common: Array
     """(4 n, 2) products of all unknowns with a delay of all frames, constant and growing, which are open."""
     of_common: Array

@@ -15,10 +15,11 @@ import numpy as np
 from virest.arrays import Array
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
+from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
 from virest.image_formation.row_clock import RowClock
 from virest.inference.frame_delays import FrameDelays, Turns, fit_frame_delays, unexplained_turns
-from virest.inference.observed_tracks import observe_tracks
+from virest.inference.observed_tracks import ObservedTracks, frame_times, observe_tracks
 from virest.inference.tracking import TrackPair
 from virest.restoration.capture import RestorationPlan, with_own_exposures
 from virest.restoration.plan_notes import NoteCode
@@ -85,24 +86,24 @@ def find_frame_times(
     profile = plan.profile
     if profile.intrinsics is None or profile.time_offset_s is None or has_frame_delays(profile):
         return None
-    turns = _turns(capture, pairs, profile)
+    observed = observe_tracks(capture, pairs, profile)
+    turns = _turns(observed, capture.imu, profile)
     found = None if turns is None else fit_frame_delays(turns)
     if turns is None or found is None or found.p >= VALUE_P:
         return None
-    noise_px = float(np.median(observe_tracks(capture, pairs, profile).noise_px))
+    noise_px = float(np.median(observed.noise_px))
     moved_px = found.jitter_s * turns.rate_rad_s * profile.intrinsics.fx_px
     log.debug("frames' delays of %.2g s (p = %.2g) move points by %.2g px", found.jitter_s, found.p, moved_px)
     if moved_px < np.sqrt(CONTRADICTED**2 - 1) * noise_px:
         return None
-    rows = _rows_late(capture, pairs, profile, found)
+    rows = _rows_late(capture, observed, profile, found)
     if rows:
-        frames = f"{abs(rows)} frame{'s' * (abs(rows) > 1)} {'late' if rows > 0 else 'early'}"
-        text = f"exposure times are logged {frames}: each frame is restored with its own"
+        text = f"exposure times are logged {rows_apart(rows)}: each frame is restored with its own"
         return FrameTimes(replace(capture, frames=with_own_exposures(capture.frames, rows)), given, rows, text)
     usable = [frame for frame in capture.frames if frame.skip_reason is None]
     wanted = [frame.index for frame in usable[:MOST_FRAMES]]
     if set(wanted) - {n for pair in pairs for n in (pair.first, pair.second)}:
-        more = _turns(capture, track_all(wanted), profile)
+        more = _turns(observe_tracks(capture, track_all(wanted), profile), capture.imu, profile)
         found = (fit_frame_delays(more) if more is not None else None) or found
     text = (
         f"stamps differ from frame to frame by {1e3 * found.jitter_s:.1f} ms (rms) from the times that points show, "
@@ -118,14 +119,20 @@ def has_frame_delays(profile: CameraProfile) -> bool:
     return any((field.kind, field.covariates) == ("delay", ("time",)) for field in profile.extensions.field)
 
 
-def _turns(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile) -> Turns | None:
-    observed = observe_tracks(capture, pairs, profile).covered(capture.imu, profile)
+def rows_apart(rows_late: int) -> str:
+    """By how many frames a row is off, in words."""
+    count, way = abs(rows_late), "late" if rows_late > 0 else "early"
+    return f"{count} frame{'s' * (count > 1)} {way}"
+
+
+def _turns(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> Turns | None:
+    observed = observed.covered(imu, profile)
     if not observed.pairs:
         return None
-    return unexplained_turns(capture.imu, observed.table(POINTS_PER_PAIR * len(observed.pairs)), profile)
+    return unexplained_turns(imu, observed.table(POINTS_PER_PAIR * len(observed.pairs)), profile)
 
 
-def _rows_late(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProfile, delays: FrameDelays) -> int:
+def _rows_late(capture: Capture, observed: ObservedTracks, profile: CameraProfile, delays: FrameDelays) -> int:
     """Rows by which exposures are logged late, if that is likelier than the log by far; else 0.
 
     Of two hypotheses, the wrong one is k times as likely as the right one with a probability of at most 1 / k (Markov's
@@ -136,7 +143,7 @@ def _rows_late(capture: Capture, pairs: Sequence[TrackPair], profile: CameraProf
     costs: dict[int, float] = {}
     for rows in ROWS_LATE:
         moved = replace(capture, frames=with_own_exposures(capture.frames, rows))
-        turns = _turns(moved, pairs, profile)
+        turns = _turns(replace(observed, exposure_s=frame_times(moved)[1]), capture.imu, profile)
         found = None if turns is None else fit_frame_delays(turns)
         if found is not None:
             costs[rows] = found.cost

@@ -38,7 +38,7 @@ other frames, so what is left there is not the blurred picture.
 
 Each predicts the error only to a factor.  ``python -m virest.app.bench --only fits`` fits the coefficients to pictures
 with ground truth: 1.50 ± 0.47, 0.74 ± 0.11, 0.13 ± 0.14, 0.29 ± 0.13, 0.63 ± 0.41 on 22 captures, median error 0.51 dB.
-These are fitted to 36 captures of a second simulator too, and differ by at most 1.3 deviations."""
+These are fitted to 36 captures of a second simulator too, and differ by at most 0.6 deviations."""
 LEFT_OVER_STD = 0.61
 """Standard deviation of that logarithm, from the same 58 captures."""
 IN_PLACE = Misplaced()

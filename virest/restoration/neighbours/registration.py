@@ -287,7 +287,7 @@ def judged_change(
         return None
     source = view.map_px(times=times)
     brought = read_at(second, source)
-    unknown = _near_clipped_light(recorded, brought, _reach_px(field, tops_lefts, times), beyond=1)
+    unknown = _near_clipped_light(recorded, brought, _reach_px(field, tops_lefts, times))
     seen = cut(np.float32(1) - unknown, tops_lefts)
     b = spectra_of(cut(brought, tops_lefts), seen)
     onto = [spectra_of(inner(wide_spectra(picture, tops_lefts) * kernels), seen) for picture in (recorded, restored)]
@@ -340,14 +340,11 @@ def _comparable(clipped: Mask, tops_lefts: Index) -> Image | None:
     return cut(cv2.blur(np.float32(~clipped), (SOFT_PX, SOFT_PX)), tops_lefts) if clipped.any() else None
 
 
-def _near_clipped_light(light: Image, there: Image, reach_px: int, beyond: int = 0) -> NDArray[np.uint8]:
-    """1 where clipped light of either of two registered reduced pictures may reach by blur.
-
-    beyond: 1 to mark also what light from beyond their edges may reach.
-    """
+def _near_clipped_light(light: Image, there: Image, reach_px: int) -> NDArray[np.uint8]:
+    """1 where clipped light of either of two registered reduced pictures, or light from beyond, may reach by blur."""
     clipped_light = (cv2.max(light, there) > CLIPPED_LIGHT).astype(np.uint8)
     around = np.ones((4 * reach_px + 1, 4 * reach_px + 1), np.uint8)
-    return cv2.dilate(clipped_light, around, borderType=cv2.BORDER_CONSTANT, borderValue=beyond)
+    return cv2.dilate(clipped_light, around, borderType=cv2.BORDER_CONSTANT, borderValue=1)
 
 
 def _registered(view: NeighbourView, second: Image, times: int, apart: Array) -> Image:
