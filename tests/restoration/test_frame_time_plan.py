@@ -78,7 +78,7 @@ def test_frames_with_jittering_stamps_are_used_when_their_points_were_seen(captu
     (field,) = plan.profile.extensions.field
     assert field.stamp_0_ns == capture.stamp_0_ns
     late_s, std_s = np.array(field.values)[:, 0], np.array(field.std)[:, 0]
-    assert np.mean(np.abs(late_s + jitter_s - np.mean(late_s + jitter_s)) < 2 * std_s + 2e-4) > 0.9
+    assert np.mean(np.abs(late_s + jitter_s - np.mean(late_s + jitter_s)) < 2 * std_s) > 0.85
 
 
 @pytest.mark.parametrize("rows", [2, -1])
@@ -94,8 +94,9 @@ def test_exposures_in_other_rows_are_given_back_to_their_frames(capture: Capture
     again = planned(late, resolve_profile(capture)[0].with_extensions(exposures_late_frames=rows))
     assert not any("logged" in text for text in said(again))
     assert again.profile.extensions.exposures_late_frames == rows
-    inner = slice(2, -2)
-    np.testing.assert_allclose(middles_s(late, again)[inner], middles_s(capture, planned(capture))[inner], atol=4e-4)
+    off_s = (middles_s(late, again) - middles_s(capture, planned(capture)))[2:-2]
+    assert np.sqrt(np.mean(off_s**2)) < 1.5e-4  # mid-exposures were off by 4 ms
+    assert np.abs(off_s).max() < 4e-4
 
 
 def test_a_profile_that_delays_frames_already_is_taken_as_it_is(capture: Capture) -> None:
