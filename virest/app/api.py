@@ -20,6 +20,7 @@ from virest.arrays import Picture
 from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame, read_capture, resolve_profile
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.imu import ImuSamples, checked_samples
 from virest.capture.profile_source import read_any_profile, require_size
 from virest.capture.records import Capture as CaptureRecord
@@ -103,11 +104,11 @@ class Capture:
         frame = self.frames[number]
         if frame.skip_reason is not None:
             return RestoredFrame(frame, "skipped", None, (frame.skip_reason,))
-        steps: dict[int, float] = {}
-        near = read_with_neighbours(self.record.movie, self._movie(), self.frames, number, plan.reach, steps)
+        coding: dict[int, FrameCoding] = {}
+        near = read_with_neighbours(self.record.movie, self._movie(), self.frames, number, plan.reach, coding)
         if near is None:
             raise self._undecodable(number)
-        return next(restore_frames(near, self.imu, plan, {number}, steps))
+        return next(restore_frames(near, self.imu, plan, {number}, coding))
 
     def plan(self, preset: str = "balanced", **settings: Any) -> RestorationPlan:
         """The plan for restoring this capture: the completed profile, translations, warnings."""

@@ -16,6 +16,7 @@ from virest.app.outputs import json_line
 from virest.app.planning import Job, Planned, ProcessOptions, plan_capture, read_with_neighbours
 from virest.app.png import png_bytes
 from virest.capture.folder import Frame
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.video import MovieIndex
 from virest.errors import VirestError
 from virest.restoration.capture import RestorationPlan, at_true_times, restore_frames
@@ -116,12 +117,12 @@ def _probe(job: Job, index: MovieIndex, plan: RestorationPlan, frame: Frame) -> 
     """Restore a frame in memory; None if that is not possible."""
     frames = list(at_true_times(job.capture.frames, plan.profile, job.capture.repeats))
     frames[frame.index] = frame  # selected, even if it belongs to the recorder's start-up
-    steps: dict[int, float] = {}
-    near = read_with_neighbours(job.capture.movie, index, frames, frame.index, plan.reach, steps)
+    coding: dict[int, FrameCoding] = {}
+    near = read_with_neighbours(job.capture.movie, index, frames, frame.index, plan.reach, coding)
     if near is None:
         return None
     began = time.perf_counter()
-    restored = next(restore_frames(near, job.capture.imu, plan, {frame.index}, steps), None)
+    restored = next(restore_frames(near, job.capture.imu, plan, {frame.index}, coding), None)
     if restored is None or restored.picture is None or restored.degradation is None:
         return None
     size = len(png_bytes(restored.picture))

@@ -18,6 +18,7 @@ from virest.app.planning import estimate_plan
 from virest.arrays import Picture
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.video import MovieIndex, probe_movie, read_frames
 from virest.errors import CaptureError
 from virest.image_formation.row_motion import RowMotion, row_motion
@@ -42,15 +43,15 @@ class TrueCapture:
     usable: tuple[Frame, ...]
     """All frames of the movie that are not skipped, in order."""
 
-    def recorded(self, reach: int = 0, steps: dict[int, float] | None = None) -> Iterator[tuple[Frame, Picture]]:
+    def recorded(self, reach: int = 0, coding: dict[int, FrameCoding] | None = None) -> Iterator[tuple[Frame, Picture]]:
         """The evaluated frames and up to ``reach`` movie frames before and after each, with RGB pixels.
 
-        steps: filled with the encoder's quantiser steps.
+        coding: filled with how each frame was coded.
         """
         judged = {frame.index for frame in self.frames}
         near = {number + step for number in judged for step in range(-reach, reach + 1)}
         wanted = {frame.index: frame for frame in self.usable if frame.index in near}
-        for number, picture in read_frames(self.capture.movie, self.index, min(wanted), max(wanted), steps):
+        for number, picture in read_frames(self.capture.movie, self.index, min(wanted), max(wanted), coding):
             if number in wanted and picture is not None:
                 yield wanted[number], picture
 
@@ -65,8 +66,8 @@ class TrueCapture:
     def restored(self, plan: RestorationPlan) -> Iterator[RestoredFrame]:
         """The evaluated frames as ``virest process`` restores them."""
         judged = {frame.index for frame in self.frames}
-        steps: dict[int, float] = {}
-        return restore_frames(self.recorded(plan.reach, steps), self.capture.imu, plan, judged, steps)
+        coding: dict[int, FrameCoding] = {}
+        return restore_frames(self.recorded(plan.reach, coding), self.capture.imu, plan, judged, coding)
 
     def motions(self, plan: RestorationPlan) -> dict[int, RowMotion]:
         """The motion over each usable frame according to the plan."""

@@ -27,6 +27,7 @@ from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import profile_mapping
 from virest.capture.folder import Capture, Frame, read_capture, resolve_profile, unpack_hint
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_decodable_gray, read_frames
@@ -267,20 +268,20 @@ def estimate_plan(
     capture: Capture, index: MovieIndex, profile: CameraProfile, settings: RestorationSettings
 ) -> RestorationPlan:
     """The plan for restoring a capture, with the values estimated from its movie that the profile does not know."""
-    steps: dict[int, float] = {}
-    read = partial(read_decodable_gray, capture.movie, index, steps=steps)
-    return plan_restoration(capture, profile, settings, read, steps)
+    coding: dict[int, FrameCoding] = {}
+    read = partial(read_decodable_gray, capture.movie, index, coding=coding)
+    return plan_restoration(capture, profile, settings, read, coding)
 
 
 def read_with_neighbours(
-    movie: Path, index: MovieIndex, frames: Sequence[Frame], number: int, reach: int, steps: dict[int, float]
+    movie: Path, index: MovieIndex, frames: Sequence[Frame], number: int, reach: int, coding: dict[int, FrameCoding]
 ) -> list[tuple[Frame, NDArray[np.uint8]]] | None:
     """A frame and its usable neighbours up to ``reach`` away, in order, RGB; None if the frame cannot be decoded.
 
-    steps: filled with the encoder's quantiser steps.
+    coding: filled with how each frame was coded.
     """
     first, last = max(number - reach, 0), min(number + reach, len(frames) - 1)
-    decoded = {n: picture for n, picture in read_frames(movie, index, first, last, steps) if picture is not None}
+    decoded = {n: picture for n, picture in read_frames(movie, index, first, last, coding) if picture is not None}
     if number not in decoded:
         return None
     return [(frames[n], decoded[n]) for n in sorted(decoded) if n == number or frames[n].skip_reason is None]

@@ -24,6 +24,7 @@ from virest.app.run_folder import RunFolder
 from virest.app.worker_processes import prepare_worker
 from virest.arrays import Picture
 from virest.capture.folder import Capture, Frame
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.imu import ImuSamples
 from virest.capture.location import is_unreachable
 from virest.capture.video import MovieIndex, read_frames
@@ -176,14 +177,14 @@ def _without_picture(frame: Frame, status: str, reason: str) -> RestoredFrame:
 
 
 def _decoded(
-    segment: Segment, seconds: dict[int, float], steps: dict[int, float]
+    segment: Segment, seconds: dict[int, float], coding: dict[int, FrameCoding]
 ) -> Iterator[tuple[Frame, Picture | None]]:
     """The segment's usable frames and their neighbours in order, each with its picture, or None if undecodable."""
     usable = [frame for frame in segment.frames if frame.skip_reason is None]
     wanted = deque(sorted((*usable, *segment.neighbours), key=lambda frame: frame.index))
     if not usable:
         return
-    source = read_frames(segment.movie, segment.index, wanted[0].index, wanted[-1].index, steps)
+    source = read_frames(segment.movie, segment.index, wanted[0].index, wanted[-1].index, coding)
     began = time.perf_counter()
     try:
         for index, picture in source:
@@ -206,7 +207,7 @@ def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[Restored
     fed: deque[tuple[Frame, Picture]] = deque()
     due = {frame.index for frame in segment.frames if frame.skip_reason is None}
     undecodable: list[Frame] = []
-    steps: dict[int, float] = {}
+    coding: dict[int, FrameCoding] = {}
 
     def feed(source: Iterable[tuple[Frame, Picture | None]]) -> Iterator[tuple[Frame, Picture | None]]:
         for frame, picture in source:
@@ -216,10 +217,10 @@ def _restored(segment: Segment, decode_s: dict[int, float]) -> Iterator[Restored
             elif frame.index in due:
                 undecodable.append(frame)
 
-    source: Iterator[tuple[Frame, Picture | None]] = _decoded(segment, decode_s, steps)
+    source: Iterator[tuple[Frame, Picture | None]] = _decoded(segment, decode_s, coding)
     while True:
         try:
-            for restored in restore_frames(feed(source), segment.imu, segment.plan, due.copy(), steps):
+            for restored in restore_frames(feed(source), segment.imu, segment.plan, due.copy(), coding):
                 due.discard(restored.frame.index)
                 while fed and fed[0][0].index < restored.frame.index - segment.plan.reach:
                     fed.popleft()

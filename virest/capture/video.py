@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.arrays import Array
-from virest.capture.coding_step import coding_step
 from virest.capture.files import label, require_regular_file
+from virest.capture.frame_coding import FrameCoding, frame_coding
 from virest.capture.location import RemotePath, unreachable
 from virest.capture.pictures import (
     MAX_SIDE_PX,
@@ -180,31 +180,31 @@ def index_pictures(path: Path, found: PictureList) -> MovieIndex:
 
 
 def read_frames(
-    path: Path, index: MovieIndex, first: int, last: int, steps: dict[int, float] | None = None
+    path: Path, index: MovieIndex, first: int, last: int, coding: dict[int, FrameCoding] | None = None
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     """Stream frames ``first`` to ``last`` (both included, ends clipped) as (frame index, RGB (h, w, 3) or None).
 
     None: the frame, or one that it depends on, cannot be decoded; later ones still follow.  One frame is in memory.
-    steps: filled with each frame's :func:`coding_step`, if it has one, before the frame is yielded.
+    coding: filled with how each frame was coded, if the decoder reports it, before the frame is yielded.
     """
-    yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb, steps)
+    yield from _read(path, index, range(max(first, 0), min(last, len(index) - 1) + 1), to_rgb, coding)
 
 
 def read_gray(
-    path: Path, index: MovieIndex, frames: Iterable[int], steps: dict[int, float] | None = None
+    path: Path, index: MovieIndex, frames: Iterable[int], coding: dict[int, FrameCoding] | None = None
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     """Stream the luma of ``frames`` (rising order) as (frame index, (h, w) or None), 0 black and 255 white.
 
-    steps: as of :func:`read_frames`.
+    coding: as of :func:`read_frames`.
     """
-    yield from _read(path, index, frames, to_gray, steps)
+    yield from _read(path, index, frames, to_gray, coding)
 
 
 def read_decodable_gray(
-    path: Path, index: MovieIndex, frames: Iterable[int], steps: dict[int, float] | None = None
+    path: Path, index: MovieIndex, frames: Iterable[int], coding: dict[int, FrameCoding] | None = None
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """As :func:`read_gray`, without the frames that cannot be decoded."""
-    return ((number, picture) for number, picture in read_gray(path, index, frames, steps) if picture is not None)
+    return ((number, picture) for number, picture in read_gray(path, index, frames, coding) if picture is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,7 +330,7 @@ def _read(
     index: MovieIndex,
     frames: Iterable[int],
     convert: Callable[..., NDArray[np.uint8]],
-    steps: dict[int, float] | None = None,
+    coding: dict[int, FrameCoding] | None = None,
 ) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     if index.pictures:
         base, size = path if path.is_dir() else path.parent, (index.width, index.height)
@@ -344,13 +344,14 @@ def _read(
                 stream = _video_stream(container, path)
                 stream.thread_type = "NONE"
                 stream.codec_context.thread_count = 1
-                extra = {} if steps is None else {"export_side_data": "venc_params"}
+                extra = {} if coding is None else {"export_side_data": "venc_params"}
                 stream.codec_context.options = {"max_pixels": str(MAX_PIXELS), **extra}
                 for frame_index, frame in _in_order(run, _decoded(container, stream, index, run[0])):
                     usable = frame is not None and (frame.width, frame.height) == (index.width, index.height)
-                    step = coding_step(frame) if usable and steps is not None else None
-                    if step is not None and steps is not None:
-                        steps[frame_index] = step
+                    if usable and coding is not None:
+                        found = frame_coding(frame, bool(stream.codec_context.has_b_frames))
+                        if found is not None:
+                            coding[frame_index] = found
                     yield frame_index, convert(frame, centred=centred) if usable else None
         except (av.FFmpegError, UnicodeError) as fault:
             raise VideoError(f"{label(path)}: cannot be read ({_reason(fault)})", hint="copy the movie again") from None

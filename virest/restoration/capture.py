@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.imu import ImuSamples
 from virest.capture.join import median_period_s, outside_reason
 from virest.image_formation.row_motion import FrameTranslation, RowMotion, row_motion
@@ -18,6 +19,7 @@ from virest.inference.unsharp_mask import UnsharpMask, without_mask
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.motion.trajectory import Trajectory
+from virest.restoration.coded_blur import FRAMES_BACK, Predicted
 from virest.restoration.frame import (
     RestoredFrame,
     copied_frame,
@@ -106,13 +108,14 @@ class RestorationPlan:
         """Number of neighbouring frames on each side that a frame's restoration uses."""
         if self.copy_reason is not None:
             return 0
-        joined = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
-        return max(joined, 0 if self.missing_turn is None and self.settings.deblur == "none" else 1)
+        if self.settings.deblur == "none":
+            return 0 if self.missing_turn is None else 1
+        return max(self.most_joined_on_a_side, 1, FRAMES_BACK)
 
-    def joined(self, before: Sequence[Sight], after: Sequence[Sight]) -> tuple[Sight, ...]:
-        """The neighbours that may take part in a frame's joint restoration, in movie order."""
-        count = self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
-        return (*before[max(len(before) - count, 0) :], *after[:count]) if count else ()
+    @property
+    def most_joined_on_a_side(self) -> int:
+        """Number of frames on each side that may take part in a frame's joint restoration."""
+        return self.settings.neighbours if self.settings.deblur in JOINT_METHODS else 0
 
     def of(self, frames: Iterable[Frame]) -> RestorationPlan:
         """The plan reduced to what a worker needs for these frames."""
@@ -127,14 +130,14 @@ def restore_frames(
     imu: ImuSamples,
     plan: RestorationPlan,
     only: Collection[int] | None = None,
-    steps: Mapping[int, float] | None = None,
+    coding: Mapping[int, FrameCoding] | None = None,
 ) -> Iterator[RestoredFrame]:
     """Restore frames one by one; ``imu`` covers them.  Frames without a picture are passed over.
 
     frames: in movie order.  only: indices of the frames to restore, the others serving as neighbours; None: all.
-    steps: the coder's quantiser step by frame index, filled in as frames are decoded; missing: unknown.
+    coding: how frames were coded, by frame index, filled in as frames are decoded; missing: unknown.
     """
-    profile, steps = plan.profile, {} if steps is None else steps
+    profile, coding = plan.profile, {} if coding is None else coding
     trajectory = integrate_gyro(imu, profile) if profile.intrinsics is not None else None
     lens = moving_lens(trajectory, profile) if trajectory is not None else None
     translations, neighbours, undistort = plan.translations or {}, None, plan.settings.undistort
@@ -150,8 +153,8 @@ def restore_frames(
         outside = outside_reason(motion.start_s, motion.end_s, imu.time_s, plan.imu_gaps_s)
         why = outside[1] if outside else ""
         if plan.mask is None or plan.copy_reason is not None:
-            return Sight(frame, picture, motion, why, coding_step=steps.get(frame.index))
-        return Sight(frame, without_mask(picture, plan.mask), motion, why, picture, steps.get(frame.index))
+            return Sight(frame, picture, motion, why, coding=coding.get(frame.index))
+        return Sight(frame, without_mask(picture, plan.mask), motion, why, picture, coding.get(frame.index))
 
     sights = (sight(frame, picture) for frame, picture in frames if picture is not None)
     for before, here, after in with_neighbours(sights, plan.reach):
@@ -176,9 +179,11 @@ def restore_frames(
             seen = moved_over_frame(trajectory, lens, frame, plan.settings.reference, moved, plan.contradicted)
         refined, compared = None, None
         if neighbours is not None:
-            refined = neighbours.refined(before, here, after)
-            joined = plan.joined(before, after)
-            if joined and plan.settings.most_joined:
+            count = max(plan.most_joined_on_a_side, 1)
+            near_before, near_after = before[max(len(before) - count, 0) :], after[:count]
+            refined = neighbours.refined(near_before, here, near_after)
+            if plan.most_joined_on_a_side and plan.settings.most_joined:
+                joined = (*near_before, *near_after)
                 compared = partial(neighbours.joined, joined, here, refined, plan.settings.most_joined)
             else:
                 adjacent = (*before[-1:], *after[:1])
@@ -197,7 +202,21 @@ def restore_frames(
             unmasked,
             here.coding_step,
             plan.undetected_rad_s,
+            predicted_from(before, here),
         )
+
+
+def predicted_from(before: Sequence[Sight], here: Sight) -> tuple[Predicted, ...]:
+    """The frames that the coder predicted a frame from, one from the next, the nearest first; at most FRAMES_BACK."""
+    found: list[Predicted] = []
+    for earlier in before[: -FRAMES_BACK - 1 : -1]:
+        coding, consecutive = here.coding, earlier.frame.index == here.frame.index - 1
+        if coding is None or not coding.from_previous or not consecutive or not earlier.usable:
+            break
+        assert earlier.motion is not None
+        found.append(Predicted(earlier.motion, coding.step))
+        here = earlier
+    return tuple(found)
 
 
 def untrusted_reason(motion: RowMotion) -> str | None:

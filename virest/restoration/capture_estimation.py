@@ -16,6 +16,7 @@ from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.folder import GUESSED_FOCAL, Capture, Frame
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.imu import ImuSamples
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import RowClock
@@ -77,22 +78,22 @@ def plan_restoration(
     profile: CameraProfile,
     settings: RestorationSettings,
     read_gray: GrayReader,
-    steps: Mapping[int, float] | None = None,
+    coding: Mapping[int, FrameCoding] | None = None,
 ) -> RestorationPlan:
     """Estimate the profile's missing values from a few dozen frames, and check that frames and gyroscope agree.
 
     read_gray: gives (index, luma) of the requested frames, in order.  The cost does not grow with the movie's length.
-    steps: the coder's quantiser step by frame index, filled in as frames are read; missing: unknown.
+    coding: how frames were coded, by frame index, filled in as frames are read; missing: unknown.
     """
-    steps = {} if steps is None else steps
+    coding = {} if coding is None else coding
     if rows := profile.extensions.exposures_late_frames:
         capture = replace(capture, frames=with_own_exposures(capture.frames, rows))
         even = profile.with_extensions(exposures_late_frames=0)
-        return for_late_exposures(plan_restoration(capture, even, settings, read_gray, steps), rows)
+        return for_late_exposures(plan_restoration(capture, even, settings, read_gray, coding), rows)
     lag = None if settings.keep_start_up else find_lag(capture, profile, read_gray)
     if lag is None:
-        return _planned(capture, profile, settings, read_gray, steps)
-    return with_lag(_planned(at_lag(capture, profile, lag), profile, settings, read_gray, steps), lag)
+        return _planned(capture, profile, settings, read_gray, coding)
+    return with_lag(_planned(at_lag(capture, profile, lag), profile, settings, read_gray, coding), lag)
 
 
 def _planned(
@@ -100,7 +101,7 @@ def _planned(
     profile: CameraProfile,
     settings: RestorationSettings,
     read_gray: GrayReader,
-    steps: Mapping[int, float],
+    coding: Mapping[int, FrameCoding],
 ) -> RestorationPlan:
     plan = RestorationPlan(
         profile, settings, _default_notes(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
@@ -144,7 +145,7 @@ def _planned(
     if plan.refusal is None:
         times = find_frame_times(plan, profile, capture, tracked, lambda n: track_pairs(read_gray(n), guide=guide))
         if times is not None:
-            again = _planned(times.capture, times.profile, settings, read_gray, steps)
+            again = _planned(times.capture, times.profile, settings, read_gray, coding)
             if times.explain(plan, again):
                 return times.noted(again)
     if plan.refusal is None and not _clock_agrees(alignment, plan.profile):
@@ -169,7 +170,7 @@ def _planned(
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
     plan = _with_blur_length_check(plan, profile, capture, powers)
-    return with_neighbour_survey(plan, capture, surveyed, lumas, steps)
+    return with_neighbour_survey(plan, capture, surveyed, lumas, coding)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from virest.image_formation.warp import corner_points, straightened_points
 from virest.motion.trajectory import Trajectory
 from virest.restoration.blurred import BlurredPicture, blurred_picture, with_vignetting
 from virest.restoration.clipped_light import keep_unmeasured, measured_share
+from virest.restoration.coded_blur import Predicted, coded_blur
 from virest.restoration.deblur import deblur
 from virest.restoration.encoding import encode_picture
 from virest.restoration.harmful_steps import OTHER_BLUR, OTHER_ROWS, deblurring_harms, straightening_harms
@@ -109,6 +110,7 @@ def restore_frame(
     unmasked: NDArray[np.uint8] | None = None,
     coding_step: float | None = None,
     undetected_rad_s: float | None = None,
+    predicted: Sequence[Predicted] = (),
 ) -> RestoredFrame:
     """Deblur in linear light, then straighten with one warp; steps that would not help are skipped, with a warning.
 
@@ -118,8 +120,9 @@ def restore_frame(
     frames for joint restoration and registers them.  unmasked: the picture with the phone's sharpening undone, to be
     deblurred; None: ``picture`` itself.  coding_step: the coder's quantiser step, grey levels; None: unknown.
     undetected_rad_s: standard deviation of the rotation rate of a motion that neighbours did not refine; None: unknown.
+    predicted: the frames that the coder predicted this one from, one from the next, the nearest first.
     """
-    clock = _Clock()
+    clock, unrefined = _Clock(), motion
     if refined is not None:
         motion = refined.motion
         if seen is not None and refined.further is not None:
@@ -145,7 +148,10 @@ def restore_frame(
             path_std_px = float(np.sqrt(np.trace(covariance_px2) / 2))
         elif undetected_rad_s is not None:
             path_std_px = unrefined_path_std_px(motion, undetected_rad_s)
-        blur = _KnownBlur(motion, anchor, longest_px, covariance_px2, path_std_px, position_std_px, light, coding_step)
+        blur = _KnownBlur(
+            motion, anchor, longest_px, covariance_px2, path_std_px, position_std_px, light, coding_step, unrefined,
+            predicted,
+        )  # fmt: skip
         restored, deblurring, why_not = _deblurred(picture, blur, settings, confirmed, neighbours, unmasked)
     if restored is picture and light is not None and light.most_change > MIN_RELIGHT:
         restored = _without_flicker(picture, curve, light)
@@ -275,6 +281,10 @@ class _KnownBlur:
     """Flicker and vignetting; None: neither."""
     coding_step: float | None
     """The coder's quantiser step, grey levels; None: unknown."""
+    unrefined: RowMotion
+    """The motion before neighbours refined it, as that of ``predicted``."""
+    predicted: Sequence[Predicted]
+    """The frames that the coder predicted this one from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,10 +339,13 @@ def _deblurred(
     if joined.pictures:
         settings = replace(settings, iterations=min(settings.iterations, settings.joined_iterations))
     sharp = keep_unmeasured(deblur(blurred, settings), recorded, blurred)
+    coded = coded_blur(picture, blur.unrefined, blur.predicted, measured.luma_model, joined.passed)
+    if blur.anchor == 0.5:
+        measured = replace(measured, share=measured.share * coded.share)
     touched, part = _blend_weights(blur, settings, blurred, measured, compared, confirmed)
     restored = _blended(sharp, recorded, part)
     changed = 0.0 if confirmed is None else _mean_square(restored, recorded)
-    details = _details(blur, settings, measured, joined, confirmed, changed)
+    details = _details(blur, settings, measured, joined, confirmed, coded.lost, changed)
     if details.expected_gain_db is not None and details.expected_gain_std_db is not None:
         why_not = no_gain_reason(measured.luma_model, details.expected_gain_db, LEAST_CONFIRMED_DB)
         if why_not:
@@ -402,9 +415,13 @@ def _details(
     measured: _BlurStatistics,
     joined: JoinedNeighbours,
     confirmed: ConfirmedGain | None,
+    lost: float,
     changed: float,
 ) -> Deblurring:
-    """How a frame was deblurred.  changed: mean square of the change by deblurring, grey levels squared."""
+    """How a frame was deblurred.
+
+    lost: see :class:`~virest.restoration.coded_blur.CodedBlur`.  changed: mean square of the change by deblurring, grey levels squared.
+    """
     model = measured.luma_model
     ideal, alone = model.ideal_error(joined.passed), model.ideal_error(np.zeros_like(joined.passed))
     misplaced = model.misplaced(blur.position_std_px, joined.passed)
@@ -413,7 +430,7 @@ def _details(
         colour = measured.chroma.colour_error()
         coded = measured.luma.noise_levels**2 if blur.coding_step is None else coded_variance(blur.coding_step)
         power = model.sharp_power
-        gain_db = confirmed.of_change_db(changed, model.blur_error, ideal, power, coded, misplaced, colour)
+        gain_db = confirmed.of_change_db(changed, lost * model.blur_error, ideal, power, coded, misplaced, colour)
     return Deblurring(
         method=settings.deblur,
         preset=settings.preset,

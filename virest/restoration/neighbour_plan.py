@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.capture.folder import Capture
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.join import outside_reason
 from virest.image_formation.blur import Image
 from virest.image_formation.row_motion import RowMotion
@@ -38,11 +39,11 @@ def with_neighbour_survey(
     capture: Capture,
     runs: Sequence[Sequence[int]],
     lumas: Mapping[int, NDArray[np.uint8]],
-    steps: Mapping[int, float],
+    coding: Mapping[int, FrameCoding],
 ) -> RestorationPlan:
     """The plan with the phone's sharpening, the missing rotation and the confirmed gain, from neighbouring frames.
 
-    lumas: of the runs' frames, by index.  steps: the coder's quantiser step by frame index; missing: unknown.
+    lumas: of the runs' frames, by index.  coding: how frames were coded, by index; missing: unknown.
     """
     profile = plan.profile
     if not lumas or profile.intrinsics is None:
@@ -55,7 +56,7 @@ def with_neighbour_survey(
         motion = moved_over_frame(trajectory, lens, frames[number], plan.settings.reference, known.get(number), profile)
         outside = outside_reason(motion.start_s, motion.end_s, capture.imu.time_s, capture.imu_gaps_s)
         why = outside[1] if outside else ""
-        sights[number] = Sight(frames[number], luma, motion, why, coding_step=steps.get(number))
+        sights[number] = Sight(frames[number], luma, motion, why, coding=coding.get(number))
     plan, sights = _without_sharpening(plan, sights)
     neighbours = FrameNeighbours(trajectory, lens, None)
     missing, undetected_rad_s = survey_turns(runs, sights, neighbours, trajectory)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from virest.arrays import Array, Picture
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import Frame
+from virest.capture.frame_coding import FrameCoding
 from virest.capture.pixels import BT601_LUMA
 from virest.image_formation.blur import Image
 from virest.image_formation.kernel_spread import kernel_spread
@@ -66,13 +67,18 @@ class Sight:
     """Why its motion is unknown, if it reaches beyond the inertial data; else empty."""
     recorded: NDArray[np.uint8] | None = None
     """The recorded picture, if the phone's sharpening was undone in ``picture``; None: ``picture`` is as recorded."""
-    coding_step: float | None = None
-    """The coder's quantiser step, grey levels; None: unknown."""
+    coding: FrameCoding | None = None
+    """How it was coded; None: unknown."""
 
     @property
     def usable(self) -> bool:
         """Whether its motion and exposure are known, so that it can be compared with its neighbours."""
         return self.motion is not None and not self.outside and self.motion.exposure_s > 0
+
+    @property
+    def coding_step(self) -> float | None:
+        """The coder's quantiser step, grey levels; None: unknown."""
+        return None if self.coding is None else self.coding.step
 
 
 def with_neighbours(

@@ -32,9 +32,9 @@ ROUNDING_POWER = 1 / 12
 """Variance of rounding to whole grey levels."""
 _LIKELY_SQUARES, _LIKELY_WEIGHTS = np.polynomial.laguerre.laggauss(12)
 """Quadrature nodes: half the squared distance, in units of the variance per axis, and their weights, which sum to 1."""
-_DEAD_ZONE = 5 / 6
+DEAD_ZONE = 5 / 6
 """Fraction of its step below which an H.264 coder drops a coefficient, and of a further step at which it rounds up."""
-_CODER_SHARE = (_DEAD_ZONE**3 + (1 - _DEAD_ZONE) ** 3) / 3
+_CODER_SHARE = (DEAD_ZONE**3 + (1 - DEAD_ZONE) ** 3) / 3
 """Mean square error of that rounding over the step's square, for remainders spread evenly over a step."""
 
 
