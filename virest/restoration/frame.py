@@ -420,7 +420,8 @@ def _details(
 ) -> Deblurring:
     """How a frame was deblurred.
 
-    lost: see :class:`~virest.restoration.coded_blur.CodedBlur`.  changed: mean square of the change by deblurring, grey levels squared.
+    lost: squared error by the stored frame's blur, over that of its path.  changed: mean square of the change by
+    deblurring, grey levels squared.
     """
     model = measured.luma_model
     ideal, alone = model.ideal_error(joined.passed), model.ideal_error(np.zeros_like(joined.passed))
