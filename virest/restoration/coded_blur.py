@@ -11,8 +11,9 @@ dead zone ± z:
 
     K_stored = K + m (K' − K),   m = 1 − e^{−u} (1 + u + u² / 2),   u = √2 z / σ.
 
-No constant is fitted.  On three simulated captures the energy that frames keep, measured with the true picture,
-correlates with m by 0.9 (``docs/method.md``).
+No constant is fitted.  With true pictures, the best part of the change by restoring was 0.28 ± 0.21 where 0.3 to 0.5
+is derived, 0.63 ± 0.24 for 0.7 to 0.8, and 0.84 ± 0.28 for 0.9 to 0.97 (mean ± scatter of 1296 frames, 36 simulated
+captures, ``fast``).
 """
 
 from __future__ import annotations
