@@ -350,7 +350,7 @@ def _deblurred(
         why_not = no_gain_reason(measured.luma_model, details.expected_gain_db, LEAST_CONFIRMED_DB)
         if why_not:
             return as_shown, None, (why_not,)
-        share = gaining_share(details.expected_gain_db, details.expected_gain_std_db)
+        share = gaining_share(details.expected_gain_db, details.expected_gain_std_db, bool(joined.pictures))
         if blur.anchor == 0.5 and share < details.share:
             less = share_map(blurred, share / details.share)
             restored, details = _blended(restored.__getitem__, recorded, less), replace(details, share=share)
