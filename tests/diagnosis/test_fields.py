@@ -715,6 +715,21 @@ def test_stamps_that_jitter_are_named_and_each_frame_gets_its_time(rng: np.rando
     assert parse_profile(profile_mapping(verdict.model.profile)).fields == verdict.model.profile.fields
 
 
+@pytest.mark.parametrize("jitter_rms_s", [0.0, 0.0015])
+def test_a_clock_offset_stays_one_whether_or_not_stamps_jitter(rng: np.random.Generator, jitter_rms_s: float) -> None:
+    """Delays of single frames are about their mean, also where some frames have no points that could hold it."""
+    setup = replace(HAND, seed=94)
+    stamps, jitter_s = StrangePhone(setup, Strange()).stamp_s, rng.normal(0.006, jitter_rms_s, HAND.frames)
+    phone = WanderingPhone(setup, lambda stamp_s: np.interp(stamp_s, stamps, jitter_s))
+    verdict, fields = judged(phone, phone.profile, rungs=2)
+    assert [cause.name for cause in verdict.accepted] == ["time_offset"]
+    off_s = verdict.model.profile.time_offset_s - phone.profile.time_offset_s
+    assert off_s == pytest.approx(0.006, abs=0.001)
+    assert [field.shape for field in fields] == (["jitter"] if jitter_rms_s else [])
+    for field in fields:
+        assert field.size == pytest.approx(np.std(jitter_s), abs=3 * field.std)
+
+
 @pytest.mark.parametrize("seed", [111, 112, 113])
 def test_stamps_that_jitter_are_named_in_a_second_of_noisy_points(seed: int) -> None:
     """A few pairs of frames turn fast and gain most: their signs tell more than the mean."""
@@ -733,7 +748,7 @@ def test_slopes_of_single_frames_delays_are_those_of_difference_quotients() -> N
     seen = point_residuals(evidence.imu, fitted, table)
     span_s = float(fitted.seconds.min()), float(fitted.seconds.max())
     for known in (frozenset(), frozenset({"time_offset", "clock_skew"})):
-        form = form_of_late_frames(phone.capture, phone.profile, span_s, known)
+        form = form_of_late_frames(phone.capture, phone.profile, span_s, phone.stamp_s, known)
         assert form is not None
         quick = slopes_of(form.term, phone.profile, table, seen.moved_by)
         plain = slopes_of(replace(form.term, slopes=None), phone.profile, table, seen.moved_by)

@@ -40,6 +40,10 @@ BLOCK_PX, DETAIL_PX = 16, 5
 """Sides of a coder's blocks, and of the squares whose mean is taken off to leave detail."""
 PARTS = 10
 """Parts of the blocks, from plain to busy: with one, up to 0.3 too much of a facade's power would count as kept."""
+ALONE_PART = 0.25
+"""Weight of the share without further pictures in the mean.  On 432 frames of twelve simulated captures (``balanced``)
+the mean gain is 2.347 dB with 0, 2.368 with ¼ and 2.365 with ½, and 6, 5 and 3 frames lose more than 0.1 dB; half costs
+0.15 dB on captures of the project's own simulator, ¼ half as much."""
 FRAMES_BACK = 2
 """Earlier frames whose blur is looked at."""
 
@@ -74,7 +78,7 @@ def coded_blur(
 
     The restoration is the linear filter that is ideal for the path's kernels: it changes the picture by D.  With the
     error E before it, ⟨E, D⟩ / |D|² of D leaves the least error.  Further pictures are coded too, which is not looked
-    at: the share is the geometric mean of that with exact ones and that with none.
+    at: the share is a geometric mean of that with exact ones and that with none.
     """
     if not before or not luma.measured:
         return CodedBlur()
@@ -102,7 +106,8 @@ def coded_blur(
         )
         shares.append(np.clip(of_stored / of_path, 0.0, 1.0) if of_path > 0 else 1.0)
     lost, lost_stored = (float(np.sum(signal * np.square(np.abs(1 - kernels)))) for kernels in (path, stored))
-    return CodedBlur(float(np.sqrt(np.prod(shares))), min(lost_stored / lost, 1.0) if lost > 0 else 1.0)
+    share = shares[0] ** ALONE_PART * shares[1] ** (1 - ALONE_PART)
+    return CodedBlur(float(share), min(lost_stored / lost, 1.0) if lost > 0 else 1.0)
 
 
 def _unevenness(picture: Picture) -> NDArray[np.float32]:

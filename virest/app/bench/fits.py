@@ -30,7 +30,7 @@ from virest.restoration.neighbours.confirmation import ConfirmedGain
 from virest.restoration.settings import PRESETS
 from virest.restoration.statistics import of_picture, ring_fit
 from virest.restoration.statistics.records import Misplaced
-from virest.restoration.taken_part import CERTAIN_JOINED_DB
+from virest.restoration.taken_part import CERTAIN_GAIN_DB
 
 Row = dict[str, Any]
 OTHER_SEEDS = 1000
@@ -138,7 +138,7 @@ class _RecordingGain(ConfirmedGain):
         colour: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[float, float]:
         self.asked.append((changed, lost, ideal, power, coded, misplaced, colour))
-        return CERTAIN_JOINED_DB, 0.0
+        return CERTAIN_GAIN_DB, 0.0
 
 
 def _opened(work: Path, workload: Workload) -> TrueCapture:

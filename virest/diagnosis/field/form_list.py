@@ -262,10 +262,18 @@ def _frame_starts_s(capture: Capture, profile: CameraProfile, span_s: tuple[floa
 
 
 def form_of_late_frames(
-    capture: Capture, profile: CameraProfile, span_s: tuple[float, float], known: frozenset[str] = frozenset()
+    capture: Capture,
+    profile: CameraProfile,
+    span_s: tuple[float, float],
+    seen_s: Array,
+    known: frozenset[str] = frozenset(),
 ) -> FieldForm | None:
-    """A delay of its own for each frame: stamps that jitter.  None for too many frames."""
+    """A delay of its own for each frame: stamps that jitter.  None for too many frames.
+
+    seen_s: stamps of frames with points.  Others have no delay of their own, which would take up the mean.
+    """
     starts_s = _frame_starts_s(capture, profile, span_s)
+    starts_s = starts_s[np.unique(np.argmin(np.abs(starts_s - np.unique(seen_s)[:, None]), axis=1))]
     return _late_frames_form(starts_s, capture.stamp_0_ns, known) if len(starts_s) <= MOST_FRAMES else None
 
 

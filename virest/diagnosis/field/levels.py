@@ -3,6 +3,7 @@
 A profile's focal length holds at some focus distance, its readout time at some exposure, and its bias at some time that
 nobody recorded.  Where they change, the given value is therefore no error as long as the camera takes it somewhere in
 its range: the field keeps its own level.  The cause is named beside the field only if the given value lies outside.
+Delays of single frames are not a range that something moves through, but errors about a level, which is their mean.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from virest.inference.tracking_bias import bias_std
 LEVELS = {
     f"scale{OVER}focus": ("focal_length", 1.0),
     f"rate{OVER}{TIME}": ("gyro_bias", -1.0),
+    f"delay{OVER}{TIME}": ("time_offset", 1.0),
     f"delay{OVER}row, {TIME}": ("readout_time", 1.0),
     f"delay{OVER}row, {EXPOSURE}": ("readout_time", 1.0),
 }
@@ -48,7 +50,7 @@ def given_value_p(
     """
     sign = LEVELS[form.family][1]
     field = form.held_in(fitted.profile, form.fields[0])
-    weights = _range_weights(field)
+    weights = np.full((1, len(field.values)), 1 / len(field.values)) if form.by_frame else _range_weights(field)
     changes = effect.total_change(given, fitted.profile) + sign * (weights @ np.array(field.values))
     nearest = np.argmin(np.abs(changes), axis=0)
     gap = np.take_along_axis(changes, nearest[None], axis=0)[0]

@@ -337,7 +337,8 @@ def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     tangent = np.concatenate([tangent, *map(search.effect, smooth)], axis=-1)
     selection = search.best(search.scored(tangent, forms))
     close = [] if selection is None else [_Proposal(forms[selection.best.index], selection)]
-    late = form_of_late_frames(capture, fitted.profile, span_s, frozenset(in_model))
+    seen_s = np.concatenate([table.first_stamp_s, table.second_stamp_s])
+    late = form_of_late_frames(capture, fitted.profile, span_s, seen_s, frozenset(in_model))
     if late is not None and late.family not in in_model:
         found = fit_frame_delays(unexplained_turns(seen.imu, seen.table, seen.fit.profile))
         p_value = 1.0 if found is None else min(found.p * search.forms_tested, 1.0)

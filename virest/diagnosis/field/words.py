@@ -239,6 +239,8 @@ def is_jitter(values: Array) -> bool:
 def _rms_of(values: Array, std: Array) -> tuple[float, float]:
     """Rms of those of values (n,) that are determined, less what their deviations (n,) add, and its own deviation."""
     known = std < np.std(values)
+    if not known.any():
+        return 0.0, float(np.median(std))
     rms = np.sqrt(max(float(np.var(values[known]) - np.mean(std[known] ** 2)), 0.0))
     return float(rms), float(rms / np.sqrt(2 * np.count_nonzero(known)))
 
