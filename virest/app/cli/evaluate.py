@@ -116,7 +116,7 @@ def deblur(
     method                          MSE  PSNR dB    SSIM  matches  correct
     blurred                       606.2    20.30  0.7464      196      170
     skimage richardson_lucy       359.0    22.58  0.7595      307      277
-    virest balanced                88.4    28.67  0.9202      726      679
+    virest balanced                88.6    28.65  0.9198      719      673
     ...
     $ virest evaluate deblur --over-time
     $ virest evaluate deblur --restored virest-out/leaves/frames --reference leaves/truth/frames
