@@ -88,8 +88,8 @@ def coded_blur(
     own = kernel_field(motion, centres_px)
     fields = [own, *(_moved_onto(kernel_field(one.motion, centres_px), own) for one in before)]
     size = int(np.clip(fast_size(4 * max(field.radius_px for field in fields)), LEAST_SIZE, LARGEST_SIZE))
-    radius_px = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size))
-    signal, noise = (np.interp(radius_px, luma.frequency, p).astype(np.float32) for p in (luma.signal, luma.noise))
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size))
+    signal, noise = (np.interp(frequency, luma.frequency, p).astype(np.float32) for p in (luma.signal, luma.noise))
     uneven = _unevenness(picture)
     path, *earlier = (_spectra(field, size) for field in fields)
     stored = earlier[-1]
@@ -97,7 +97,7 @@ def coded_blur(
         apart = stored - kernels
         stored = kernels + _kept(np.square(np.abs(apart)) * signal, DEAD_ZONE * one.step, uneven) * apart
     shares = []
-    for joined in (0.0, np.interp(radius_px, luma.frequency, further).astype(np.float32)):
+    for joined in (0.0, np.interp(frequency, luma.frequency, further).astype(np.float32)):
         solved = 1 / (np.square(np.abs(path)) + joined + noise / signal)
         amplified = np.conj(path) * solved - 1
         of_path, of_stored = (
