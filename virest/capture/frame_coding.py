@@ -39,19 +39,19 @@ def frame_coding(frame: Any, reordered: bool) -> FrameCoding | None:
     reordered: whether the movie has frames that are predicted from later ones; what a frame is predicted from is then
     not told.
     """
-    step = _step(frame)
-    if step is None:
+    found = _kind_and_step(frame)
+    if found is None:
         return None
-    kind, level = step
-    return FrameCoding(level, kind == H264_PARAMETERS and not reordered and frame.pict_type == PREDICTED)
+    kind, step = found
+    return FrameCoding(step, kind == H264_PARAMETERS and not reordered and frame.pict_type == PREDICTED)
 
 
-def _step(frame: Any) -> tuple[int, float] | None:
-    """The kind of parameters and the mean step; None: not reported.
+def _kind_and_step(frame: Any) -> tuple[int, float] | None:
+    """The kind of the encoder's parameters and the mean step, grey levels; None: not reported.
 
-    FFmpeg's decoders report it for H.264 and VP9 (``AVVideoEncParams``: a header, then the QP difference of each
-    block), not for HEVC.  ``frame.side_data`` is not used: it stores its
-    result in the frame, a reference cycle that keeps a whole picture in memory until the garbage collector runs.
+    FFmpeg's decoders report them for H.264 and VP9 (``AVVideoEncParams``: a header, then the QP difference of each
+    block), not for HEVC.  ``frame.side_data`` is not used: it stores its result in the frame, a reference cycle that
+    keeps a whole picture in memory until the garbage collector runs.
     """
     for side_data in SideDataContainer(frame):  # type: ignore[call-arg]  # missing from its stub
         if side_data.type.name != "VIDEO_ENC_PARAMS":

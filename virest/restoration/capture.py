@@ -110,7 +110,7 @@ class RestorationPlan:
             return 0
         if self.settings.deblur == "none":
             return 0 if self.missing_turn is None else 1
-        return max(self.most_joined_on_a_side, 1, FRAMES_BACK)
+        return max(self.most_joined_on_a_side, FRAMES_BACK)
 
     @property
     def most_joined_on_a_side(self) -> int:

@@ -230,14 +230,18 @@ def test_moving_objects_do_not_become_worse(simulated):
 
 @pytest.mark.scenario
 def test_moving_objects_do_not_become_worse_in_frames_restored_alone(simulated, monkeypatch):
-    """Adjacent frames show what moves, and the static scene still gains."""
+    """Adjacent frames show what moves, and the static scene still gains.
+
+    Less is taken of frames that the coder predicted, of both alike: here none counts as predicted.
+    """
     capture = simulated(moving_px_s=240.0)
+    monkeypatch.setattr("virest.restoration.capture.predicted_from", lambda *_: ())
     plan = replace(capture.plan(PRESETS["fast"]), confirmed=None)
     checked = _gains(capture, plan)
     monkeypatch.setattr("virest.restoration.neighbours.sights.moves_on_its_own", lambda *_: False)
     unchecked = _gains(capture, plan)
     assert checked.min() > -0.1
-    assert checked.mean() > unchecked.mean() + 0.05
+    assert checked.mean() > unchecked.mean() + 0.1
 
 
 def test_a_frame_does_not_depend_on_the_rest_of_the_movie(simulated):
