@@ -730,6 +730,16 @@ def test_a_clock_offset_stays_one_whether_or_not_stamps_jitter(rng: np.random.Ge
         assert field.size == pytest.approx(np.std(jitter_s), abs=3 * field.std)
 
 
+def test_only_frames_with_points_have_a_delay_of_their_own() -> None:
+    """Free delays of others would hold the mean that a clock offset leaves to no frame, and stand in for it."""
+    phone = WanderingPhone(replace(HAND, seed=94), lambda stamp_s: np.full_like(stamp_s, 0.006))
+    ends_s = phone.stamp_s[[0, -1]]
+    for seen_s in (phone.stamp_s, phone.stamp_s[2:-2]):
+        form = form_of_late_frames(phone.capture, phone.profile, (ends_s[0], ends_s[1]), seen_s)
+        assert form is not None
+        np.testing.assert_allclose(form.fields[0].knots[0], seen_s, atol=1e-4)
+
+
 @pytest.mark.parametrize("seed", [111, 112, 113])
 def test_stamps_that_jitter_are_named_in_a_second_of_noisy_points(seed: int) -> None:
     """A few pairs of frames turn fast and gain most: their signs tell more than the mean."""
