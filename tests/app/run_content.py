@@ -32,3 +32,22 @@ def without_clocks(files: dict[str, bytes], *elsewhere: str) -> dict[str, Any]:
         account["inputs"] = [{k: v for k, v in facts.items() if k != "path"} for facts in account["inputs"]]
     found["run.json"] = {k: v for k, v in account.items() if k not in (*CLOCKS, *elsewhere)}
     return found
+
+
+def differences(run: Path, expected: dict[str, Any]) -> list[str]:
+    """In what a run's content differs, by name: whole contents would fill pages if a test fails."""
+    found = content(run)
+    names = sorted(found.keys() | expected.keys())
+    said = [f"{name}: {_change(name in expected, name in found)}" for name in names
+            if found.get(name) != expected.get(name)]  # fmt: skip
+    for old, new in zip(expected["parameters.jsonl"], found["parameters.jsonl"], strict=False):
+        said += [f"frame {old['frame']}: {text}" for text in _changed_values(old, new)]
+    return said + [f"run.json: {text}" for text in _changed_values(expected["run.json"], found["run.json"])]
+
+
+def _change(expected: bool, found: bool) -> str:
+    return "other content" if expected and found else "not there" if expected else "not expected"
+
+
+def _changed_values(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    return [f"{key} {old.get(key)} -> {new.get(key)}" for key in old | new if old.get(key) != new.get(key)]

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from run_content import content
+from run_content import content, differences
 
 from virest.app import outputs
 from virest.app.cli import run
@@ -353,7 +353,7 @@ def test_an_existing_run_is_protected_resumed_or_replaced(virest: Virest, tiny: 
     assert_refused(virest(*arguments, "0:2"), 8, "--overwrite")
     assert_refused(virest(*arguments, "0:2", "--resume"), 8, "frames")
     assert virest(*arguments, "0:3", "--resume").returncode == 0
-    assert content(run) == before
+    assert differences(run, before) == []
     assert virest(*arguments, "0:2", "--overwrite").returncode == 0
     assert {name for name in below(run) if name.endswith(".png")} == {"frames/000000.png", "frames/000001.png"}
 
@@ -407,7 +407,7 @@ def test_a_disk_that_rejects_writes(
     if after < 10:
         assert not (tiny.parent / "out/tiny").exists()
     assert virest_here(*arguments, "--resume").returncode == 0
-    assert content(tiny.parent / "out/tiny") == undisturbed
+    assert differences(tiny.parent / "out/tiny", undisturbed) == []
 
 
 @pytest.mark.parametrize(
@@ -486,7 +486,7 @@ def test_a_batch_prints_and_writes_the_same_for_any_number_of_jobs(virest: Vires
         said[jobs] = result.stderr
     assert said[1] == said[2]
     for name in names:
-        assert content(tiny.parent / "out1" / name) == content(tiny.parent / "out2" / name)
+        assert differences(tiny.parent / "out1" / name, content(tiny.parent / "out2" / name)) == []
 
 
 def test_an_undecodable_frame_fails_only_its_group(virest: Virest, tiny: Path) -> None:
@@ -577,7 +577,7 @@ def test_ctrl_c_leaves_only_complete_files_and_resume_continues(
     assert "Traceback" not in errors
     assert not [name for name in below(tmp_path / "out") if name.endswith((".part", ".lock", "run.json"))]
     assert virest(*arguments, 1, "--resume").returncode == 0
-    assert content(tmp_path / "out/swing") == undisturbed_swing
+    assert differences(tmp_path / "out/swing", undisturbed_swing) == []
 
 
 @pytest.mark.scenario
@@ -600,7 +600,7 @@ def test_resume_after_a_kill_gives_the_same_run(
     assert virest(*alone, tmp_path / "out", "--resume").returncode == 0
     assert (run / first).stat().st_mtime_ns == written_ns
     assert virest(*alone, tmp_path / "undisturbed").returncode == 0
-    assert content(run) == content(tmp_path / "undisturbed/swing")
+    assert differences(run, content(tmp_path / "undisturbed/swing")) == []
 
 
 @pytest.mark.scenario
@@ -613,7 +613,7 @@ def test_the_files_do_not_depend_on_the_number_of_jobs(
         options = ("--preset", preset, "--frames", "0:14", "--jobs", jobs)
         result = virest("process", long_swing, "--out", tmp_path / str(jobs), *options)
         assert result.returncode == 0, result.stderr
-    assert content(tmp_path / "1/swing") == content(tmp_path / "2/swing")
+    assert differences(tmp_path / "1/swing", content(tmp_path / "2/swing")) == []
 
 
 @pytest.mark.scenario

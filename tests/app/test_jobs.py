@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 from virest.app import jobs, segments
 from virest.app.jobs import PrefetchedCalls, Workers, run_segments
 from virest.app.run_folder import RunFolder
-from virest.app.segments import Segment, cut_frames, cut_imu, run_segment
+from virest.app.segments import Segment, cut_frames, cut_imu, run_or_fail_segment, run_segment
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import Frame
 from virest.capture.imu import ImuSamples
@@ -232,6 +233,33 @@ def test_a_full_disk_ends_the_segment_and_leaves_no_log(segment: Segment, monkey
     assert pictures(segment) == set()
 
 
+@pytest.mark.usefixtures("decoder", "restoration")
+def test_a_worker_that_outlives_its_run_writes_nothing(segment: Segment) -> None:
+    """A worker cut off from its cluster goes on, while the run is resumed and finished elsewhere."""
+    segment.run.segments.rmdir()
+    with pytest.raises(OutputError, match="has ended"):
+        run_segment(segment)
+    assert pictures(segment) == set()
+
+
+@pytest.mark.usefixtures("restoration")
+def test_a_fault_within_a_segment_is_written_where_it_happens(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The frames' lines say what happened; skipped frames stay skipped."""
+    monkeypatch.setattr(segments, "read_frames", None)
+    assert run_or_fail_segment(segment) == {"failed": 3, "skipped": 1}
+    assert "NoneType" in lines_of(segment)[0]["warnings"][0]
+
+
+def test_a_connection_that_breaks_is_no_fault_of_the_frames(segment: Segment) -> None:
+    """A cluster may lose a result that a worker has computed: the segment is lost, its frames have not failed."""
+    future: Future[dict[str, int]] = Future()
+    future.set_exception(OSError("Timed out during handshake while connecting"))
+    assert jobs._collect(future, segment, Workers(1)) is None
+    assert not segment.log_path.exists()
+
+
 # ── many segments ────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -281,7 +309,7 @@ def _die_on_second(segment: Segment) -> dict[str, int]:
 @pytest.mark.scenario
 def test_a_dying_worker_fails_only_its_own_segment(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lost segments are retried one at a time; only the one that kills its worker again fails for that reason."""
-    monkeypatch.setattr(jobs, "run_segment", _die_on_second)
+    monkeypatch.setattr(jobs, "run_or_fail_segment", _die_on_second)
     workers = Workers(2)
     parts = one_frame_segments(segment, 5)
     done = {part.frames[0].index: counts for part, counts in run_segments(iter(parts), workers)}

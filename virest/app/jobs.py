@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Generic
 
 from virest.app.cluster import ClusterExecutor
-from virest.app.segments import Segment, fail_segment, reason_of, run_segment
+from virest.app.segments import Segment, fail_segment, run_or_fail_segment
 from virest.app.worker_processes import Result, SerialExecutor, process_pool, submit_uninterrupted
 from virest.capture.location import is_unreachable
 from virest.errors import OutputError, RestorationError, VirestError
@@ -59,7 +59,7 @@ class Workers:
 
     def submit(self, segment: Segment) -> Future[dict[str, int]]:
         """Submit a segment to the executor."""
-        return self.call(run_segment, segment)
+        return self.call(run_or_fail_segment, segment)
 
     def call(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
         """Submit a function call to a worker."""
@@ -163,22 +163,18 @@ def _await_first(futures: Iterable[Future[Result]], workers: Workers) -> set[Fut
 
 
 def _collect(future: Future[dict[str, int]], segment: Segment, workers: Workers) -> dict[str, int] | None:
-    """The counts of a finished segment; None if its worker died."""
+    """The counts of a finished segment; None if its worker died or a cluster lost the result."""
     try:
         return future.result()
     except OutputError:
         raise
     except CancelledError:
         raise workers.lost() from None
-    except BrokenExecutor:
-        return None
-    except Exception as error:  # reported in the frames' lines; the other segments continue
+    except Exception as error:  # not of the segment, which catches its own
         if is_unreachable(error):
             raise
-        if _is_killed(error):
-            return None
         log.debug("segment %s", segment.log_path.stem, exc_info=True)
-        return fail_segment(segment, reason_of(error))
+        return None
 
 
 def _rescue(lost: list[Segment], running: Running, workers: Workers) -> Iterator[tuple[Segment, dict[str, int]]]:

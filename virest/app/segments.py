@@ -26,7 +26,7 @@ from virest.arrays import Picture
 from virest.capture.folder import Capture, Frame
 from virest.capture.frame_coding import FrameCoding
 from virest.capture.imu import ImuSamples
-from virest.capture.location import is_unreachable
+from virest.capture.location import is_remote, is_unreachable
 from virest.capture.video import MovieIndex, read_frames
 from virest.errors import OutputError, VirestError
 from virest.motion.optics import settling_time_s
@@ -150,6 +150,20 @@ def run_segment(segment: Segment) -> dict[str, int]:
     return _write_log(segment, lines)
 
 
+def run_or_fail_segment(segment: Segment) -> dict[str, int]:
+    """As :func:`run_segment`; whatever else goes wrong in it is written into its frames' lines: they failed.
+
+    So what a caller on another machine catches besides OutputError and an unreachable input is the cluster's fault.
+    """
+    try:
+        return run_segment(segment)
+    except Exception as error:  # the other segments continue
+        if isinstance(error, OutputError) or is_unreachable(error):
+            raise
+        log.debug("segment %s", segment.log_path.stem, exc_info=True)
+        return fail_segment(segment, reason_of(error))
+
+
 def fail_segment(segment: Segment, reason: str) -> dict[str, int]:
     """Write the log of a segment that could not be processed: its frames failed, skipped ones stay skipped."""
     failed = (_without_picture(f, "failed", reason) for f in segment.frames if f.skip_reason is None)
@@ -252,6 +266,7 @@ def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> 
     if segment.pictures.skip_copied and restored.status == "copied":
         restored = replace(restored, picture=None)
     path = segment.run.picture(restored.frame.index)
+    _require_unfinished(segment.run)
     began = time.perf_counter()
     if restored.picture is None:
         try:
@@ -265,6 +280,12 @@ def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> 
     write_s = time.perf_counter() - began if restored.picture is not None else 0.0
     seconds = {"decode": decode_s, "estimate": 0.0, "deblur": 0.0, "shutter": 0.0, "write": write_s, **restored.seconds}
     return frame_line(segment.capture_name, segment.plan.profile, restored, path, seconds)
+
+
+def _require_unfinished(run: RunFolder) -> None:
+    """Raise OutputError if the run has ended, so that a worker that outlived its cluster leaves the folder alone."""
+    if not is_remote(run.path) and not run.segments.is_dir():
+        raise OutputError(f"{run.path}: the run has ended without this worker", hint="nothing to do: stop the worker")
 
 
 def recorded_mask(picture: Picture, source_px: NDArray[np.float32] | None) -> Picture:
