@@ -13,8 +13,19 @@ from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import Shutter
 from virest.capture.records import Frame
-from virest.diagnosis.findings import GEOMETRY, FieldFinding, Finding, HeldOutGain
-from virest.diagnosis.followed_log import with_followed_log, with_late_exposures
+from virest.diagnosis.findings import (
+    CONSISTENT,
+    EXPLAINED,
+    GEOMETRY,
+    UNEXPLAINED,
+    Diagnosis,
+    FieldFinding,
+    Finding,
+    HeldOutGain,
+    Nominal,
+    Remaining,
+)
+from virest.diagnosis.followed_log import rows_late, with_followed_log, with_late_exposures, with_own_exposures_told
 from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.picture_ladder import PictureVerdict, climb_observations
 
@@ -109,6 +120,40 @@ def test_delays_of_the_mid_exposures_have_the_exposure_table_as_rival(
     late = Field("delay", ("time",), (tuple(start_s.tolist()),), tuple((float(v),) for v in late_s), (), 0)
     gain = HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1)
     found = FieldFinding(("time",), "delay", "jitter", "late", 0.002, "s", None, gain, 1e-9, (), 1.0, "", "", (late,))
-    told = with_late_exposures(found, frames, CameraProfile(640, 480, shutter=shutter))
+    told = with_late_exposures(found, rows_late(found, frames, CameraProfile(640, 480, shutter=shutter)))
     assert told.confounded == (() if named is None else (f"exposure times logged {named}",))
     assert (told == found) is (named is None)
+
+
+def _judged(
+    left_px: float, noise_px: float, *, unexplained: bool = False, fields: tuple[FieldFinding, ...] = ()
+) -> Diagnosis:
+    nominal = Nominal(left_px, noise_px, None, None, 500, 90)
+    left = Remaining(1e-9 if unexplained else 0.5, "time", 0.5, 0.3, GEOMETRY, unexplained)
+    verdict = UNEXPLAINED if unexplained else EXPLAINED if fields else CONSISTENT
+    profile = CameraProfile(640, 480)
+    residuals = {"before": {"x_px": left_px}, "after": {"x_px": left_px}}
+    return Diagnosis(verdict, nominal, (), left, profile, profile, fields=fields, residuals=residuals)
+
+
+@pytest.mark.parametrize(
+    ("left_px", "noise_px", "unexplained", "better"),
+    [(0.32, 0.3, False, True), (0.42, 0.4, False, True), (0.5, 0.3, False, False), (0.32, 0.3, True, False)],
+)
+def test_an_exposure_table_that_explains_as_much_as_a_delay_of_each_frame_is_the_finding(
+    left_px: float, noise_px: float, unexplained: bool, better: bool
+) -> None:
+    """As much of what exceeds the noise, which another tracking may have changed, and nothing new left."""
+    gain = HeldOutGain(GEOMETRY, 1.0, 0.31, 0.3)
+    late = FieldFinding(("time",), "delay", "jitter", "late", 0.002, "s", None, gain, 1e-9, (), 1.0, "", "")
+    found, given = _judged(1.1, 0.3, fields=(late,)), _judged(left_px, noise_px, unexplained=unexplained)
+    told = with_own_exposures_told(found, given, -1)
+    if not better:
+        assert told is found
+        return
+    (table,) = told.fields
+    assert (table.kind, table.size, table.p_value, told.verdict) == ("exposure_rows", -1.0, 1e-9, EXPLAINED)
+    assert "logged 1 frame early" in table.sentence
+    assert table.held_out.gain == pytest.approx(1 - (left_px**2 - noise_px**2) / (1 - noise_px**2))
+    assert told.nominal is found.nominal
+    assert (told.residuals["before"], told.residuals["after"]) == ({"x_px": 1.1}, {"x_px": left_px})

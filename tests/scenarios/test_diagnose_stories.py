@@ -24,8 +24,8 @@ def _capture(work: Path, name: str, effects: list[str], seed: int, **options: An
     upright = seed % 2
     size = {"width": 288, "height": 384} if upright else {"width": 384, "height": 288}
     simulate_command(
-        work / name, frames=33, seed=seed, effects=effects, rate_rad_s=1.1, overwrite=True, truth_frames=False,
-        **{"exposure_ms": 8, **size, **options},
+        work / name, seed=seed, effects=effects, rate_rad_s=1.1, overwrite=True, truth_frames=False,
+        **{"frames": 33, "exposure_ms": 8, **size, **options},
     )  # fmt: skip
     return work / name
 
@@ -91,3 +91,26 @@ def test_an_uncatalogued_fault_is_described(work: Path) -> None:
     (field,) = found.fields
     assert "it clips" in field.sentence
     assert field.held_out.after < 1.5 * field.held_out.noise < 0.1 * field.held_out.before
+
+
+def test_exposures_logged_for_other_frames_are_the_only_finding(work: Path) -> None:
+    """Neither stamps that jitter nor brightness that drifts; the extended profile gives each frame its own exposure."""
+    exposures_ms = (10 * (1 + 0.5 * np.sin(np.arange(60) / 2))).tolist()
+    folder = _capture(work, "late_exposures", [], 424, frames=60, exposure_ms=exposures_ms)
+    table = folder / "movie_metadata.csv"
+    head, *rows = [line.split(",") for line in table.read_text().splitlines()]
+    shifted = [*([rows[0]] * 2), *rows[:-2]]
+    logged = [head.index(name) for name in ("Exposure time[nanosec]", "ISO")]
+    lines = [
+        [late[k] if k in logged else own[k] for k in range(len(head))] for own, late in zip(rows, shifted, strict=True)
+    ]
+    table.write_text("\n".join(map(",".join, [head, *lines])) + "\n")
+    found = diagnose_folder(folder)
+    assert not found.causes
+    print([f.sentence for f in found.fields], found.unexplained)
+    (field,) = found.fields
+    assert (field.kind, field.size) == ("exposure_rows", 2.0)
+    assert "logged 2 frames late" in field.sentence
+    assert found.verdict == EXPLAINED
+    assert found.extended_profile.extensions.exposures_late_frames == 2
+    assert not found.extended_profile.extensions.field

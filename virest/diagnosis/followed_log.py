@@ -23,7 +23,16 @@ from virest.capture.records import Frame
 from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION
 from virest.diagnosis.field.words import SAMPLES, curve_shape
-from virest.diagnosis.findings import FieldFinding, Finding, HeldOutGain, Rival
+from virest.diagnosis.findings import (
+    EXPLAINED,
+    GEOMETRY,
+    UNEXPLAINED,
+    Diagnosis,
+    FieldFinding,
+    Finding,
+    HeldOutGain,
+    Rival,
+)
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import FollowedGain
 from virest.diagnosis.photometry_fit import fit_photometry, judge
@@ -34,6 +43,8 @@ from virest.restoration.frame_time_plan import ROWS_LATE, rows_apart
 
 KNOTS = 5
 """Most knots of a curve over a logged quantity: a cubic spline through 5 follows one period to 10 % (rms)."""
+TABLE = "exposure_rows"
+"""Kind of the finding for an exposure table that is some rows off; ``extensions.exposures_late_frames`` holds it."""
 FROM_ONE = 0.25
 """Largest difference from 1 of the factor by which gains follow another frame's exposure × ISO: half way to the factor
 of an encoder that is late by half a frame (DELAY_FRAMES)."""
@@ -77,14 +88,14 @@ class _Followed:
     held_out: HeldOutGain
 
 
-def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], profile: CameraProfile) -> FieldFinding:
-    """A delay of frames, with the exposures of other frames as rival if their mid-exposures are delayed like that.
+def rows_late(finding: FieldFinding, frames: Sequence[Frame], profile: CameraProfile) -> int:
+    """Rows by which the exposure table is off if a delay of frames has the shape and size of that; else 0.
 
     frames: all of the movie, by index.  With the exposure of the frame that is N rows away, mid-exposures move by
     half of the difference if a timestamp marks the exposure's start.
     """
     if (finding.kind, finding.covariates) != ("delay", (TIME,)):
-        return finding
+        return 0
     (late,), shutter, clock = finding.fields, profile.shutter, RowClock(profile)
     exposure_s = np.array([frame.exposure_s or np.nan for frame in frames])
     start_s = np.array([clock.start_on_camera_s(frame.time_s, frame.exposure_s or 0.0) for frame in frames])
@@ -99,11 +110,56 @@ def with_late_exposures(finding: FieldFinding, frames: Sequence[Frame], profile:
         factor = float(expected_s @ found_s / (expected_s @ expected_s))
         left_s = found_s - np.mean(found_s) - factor * expected_s
         if np.var(left_s) < (1 - RIVAL_GAIN_FRACTION) * np.var(found_s) and abs(factor - 1) < FROM_ONE:
-            rival = f"exposure times logged {rows_apart(rows)}"
-            remedy = f"with exposures_late_frames: {rows} in the profile's extensions, each frame is given its own"
-            sentence = f"{finding.sentence}; {rival} would explain it ({remedy})"
-            return replace(finding, confounded=(*finding.confounded, rival), sentence=sentence)
-    return finding
+            return rows
+    return 0
+
+
+def with_late_exposures(finding: FieldFinding, rows: int) -> FieldFinding:
+    """A delay of frames with the exposure table, ``rows`` off, as rival; 0: it is none."""
+    if not rows:
+        return finding
+    rival = f"exposure times logged {rows_apart(rows)}"
+    sentence = f"{finding.sentence}; {rival} would explain it"
+    return replace(finding, confounded=(*finding.confounded, rival), sentence=sentence)
+
+
+def with_own_exposures_told(found: Diagnosis, given: Diagnosis, rows: int) -> Diagnosis:
+    """One of two diagnoses: of the capture as logged, and with each frame's own exposure, from ``rows`` away.
+
+    A table that is off has no free number besides its rows.  It is the better account of a delay of each frame if it
+    removes as much as a rival of the delay must, and nothing is left in the points that was not before.
+    """
+    delay = next(field for field in found.fields if (field.kind, field.covariates) == ("delay", (TIME,)))
+    gain = replace(delay.held_out, after=_points_left_px(given), noise=given.nominal.geometry_noise_px)
+    if (gain.gain or 0.0) < RIVAL_GAIN_FRACTION * (delay.held_out.gain or 0.0):
+        return found
+    if given.unexplained.significant and not found.unexplained.significant:
+        return found
+    sentence = (
+        f"exposure times and ISO values are logged {rows_apart(rows)} (points {gain.before:.3f} px → {gain.after:.3f} "
+        "px): with its own, each frame is where the points are"
+    )
+    told = FieldFinding(
+        ("exposure",), TABLE, f"{rows} rows", sentence, float(rows), "frames", None, gain, delay.p_value, (), None,
+        "a recorder that joins two queues, or an encoder that drops its first frames",
+        "film a lamp that is switched on, and compare the row of the jump with the frame of the jump",
+    )  # fmt: skip
+    verdict = UNEXPLAINED if given.unexplained.significant else EXPLAINED
+    return replace(
+        given,
+        verdict=verdict,
+        nominal=found.nominal,
+        nominal_profile=found.nominal_profile,
+        fields=(told, *given.fields),
+        residuals={**given.residuals, "before": found.residuals["before"]},
+    )
+
+
+def _points_left_px(found: Diagnosis) -> float:
+    """Held-out rms of the points with all that a diagnosis adds."""
+    fields = [field.held_out.after for field in found.fields if field.held_out.quantity == GEOMETRY]
+    rungs = [rung.tried.get(rung.entered or "", rung.before) for rung in found.ladder if rung.quantity == GEOMETRY]
+    return min(fields) if fields else [found.nominal.geometry_rms_px, *rungs][-1]
 
 
 def with_followed_log(light: PictureVerdict, frames: Sequence[Frame], each: ParallelMap = one_by_one) -> PictureVerdict:

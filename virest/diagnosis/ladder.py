@@ -27,8 +27,16 @@ from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
 from virest.diagnosis.field.brightness import instead_of_cause, light_field, with_light_field
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
-from virest.diagnosis.findings import CONSISTENT, EXPLAINED, UNEXPLAINED, Diagnosis, Finding, Nominal
-from virest.diagnosis.followed_log import with_followed_log, with_late_exposures
+from virest.diagnosis.findings import (
+    CONSISTENT,
+    EXPLAINED,
+    UNEXPLAINED,
+    Diagnosis,
+    FieldFinding,
+    Finding,
+    Nominal,
+)
+from virest.diagnosis.followed_log import rows_late, with_followed_log, with_late_exposures, with_own_exposures_told
 from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
@@ -80,15 +88,36 @@ def diagnose_capture(
     gray is then sent to other processes.  Raises CaptureError if too few pairs of frames have trackable points.
     """
     report = progress or (lambda _text, _part: None)
+    session = _climbed(capture, profile, pictures, gray, report, each, frozenset(kept_back))
+    found = session.conclude()
+    if not session.exposures_late_frames:
+        return found
+    further = profile.extensions.exposures_late_frames + session.exposures_late_frames
+    own = profile.with_extensions(exposures_late_frames=further)
+    given = _climbed(capture, own, pictures, gray, report, each, frozenset(kept_back)).conclude()
+    return with_own_exposures_told(found, given, session.exposures_late_frames)
+
+
+def _climbed(
+    capture: Capture,
+    profile: CameraProfile,
+    pictures: Reader,
+    gray: Reader,
+    report: Progress,
+    each: ParallelMap,
+    kept_back: frozenset[int],
+) -> DiagnosisSession:
+    """The session after all stages; frames whose exposure was logged in no row are kept back as well."""
     report("tracking", 0.02)
+    kept_back |= _without_own_exposure(len(capture.frames), profile.extensions.exposures_late_frames)
     capture = replace(capture, frames=at_true_times(capture.frames, profile, capture.repeats))
-    points, notes = _tracked(capture, profile, gray, each, frozenset(kept_back))
+    points, notes = _tracked(capture, profile, gray, each, kept_back)
     report("points", 0.15)
     first = points.climbed(lambda part: report("points", 0.15 + 0.35 * part))
     session = DiagnosisSession(
         capture, points, first, first, PictureVerdict(first.model.profile), notes=notes, each=each
     )
-    session.kept_back = frozenset(kept_back)
+    session.kept_back = kept_back
     session.start_field_search()
     report("brightness", 0.5)
     session.judge_light(pictures, gray, profile, lambda part: report("points again", 0.65 + 0.1 * part))
@@ -100,7 +129,12 @@ def diagnose_capture(
     report("edges", 0.95)
     session.judge_edges(gray)
     report("what is left", 0.97)
-    return session.conclude()
+    return session
+
+
+def _without_own_exposure(frames: int, rows_late: int) -> frozenset[int]:
+    """Movie indices of the frames before the first row or after the last one of a table that is some rows off."""
+    return frozenset(range(min(-rows_late, frames)) if rows_late < 0 else range(max(frames - rows_late, 0), frames))
 
 
 def _tracked(
@@ -165,6 +199,8 @@ class DiagnosisSession:
     each: ParallelMap = one_by_one
     kept_back: frozenset[int] = frozenset()
     """Movie indices of frames that only the photometric stage may use."""
+    exposures_late_frames: int = 0
+    """Rows by which the exposure table is off if that explains a delay of frames; known at the end."""
     _needs_fields_unlit: Callable[[], bool] | None = None
     """Returns whether the points of the first verdict require fields without flicker; None: not started."""
 
@@ -284,6 +320,12 @@ class DiagnosisSession:
         trajectory = integrate_gyro(self.capture.imu, extended)
         self.edges = judge_sharpening(shown, extended, trajectory, gray, self.each, self.blur.steps)
 
+    def _with_late_exposures(self, told: FieldFinding) -> FieldFinding:
+        """A delay of frames with the exposure table as rival, whose rows are then tried."""
+        rows = rows_late(told, self.capture.frames, self.geometric.model.profile)
+        self.exposures_late_frames = self.exposures_late_frames or rows
+        return with_late_exposures(told, rows)
+
     def conclude(self) -> Diagnosis:
         """The diagnosis, assembled from all stages."""
         assert self.blur is not None
@@ -293,7 +335,7 @@ class DiagnosisSession:
         findings = [*self.findings, *(finding for stage in stages for finding in stage.findings)]
         findings.sort(key=lambda f: -f.held_out.before / max(f.held_out.after, 1e-9))
         told = [finding_of(entry, self.geometric.noise_px) for entry in self.geometric.fields]
-        fields = [with_late_exposures(field, self.capture.frames, self.geometric.model.profile) for field in told]
+        fields = [self._with_late_exposures(field) for field in told]
         extended, light = self.curve.profile, self.light
         if (patches := light.observations) is not None:
             name, without, instead = instead_of_cause(patches, extended, {finding.name for finding in findings})

@@ -46,6 +46,8 @@ class Hidden:
     """Standard deviation of a Gaussian blur at the corners, proportional to the squared distance from the centre."""
     focus_dioptres: Callable[[Array], Array] | None = None
     """(frame time) → logged focus distance."""
+    exposures_late_frames: int = 0
+    """Rows by which exposure times and ISO values are logged late (negative: early)."""
 
 
 NOTHING = Hidden()

@@ -292,8 +292,9 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
     readout = round(nominal.shutter.readout_time_s * 1e9)
     rows = []
     last = len(session.stamp_ns) - 1
+    late = nominal.extensions.exposures_late_frames + session.hidden.exposures_late_frames
     for k, stamp in enumerate(session.stamp_ns.tolist()):
-        own = min(max(k - session.nominal.extensions.exposures_late_frames, 0), last)
+        own = min(max(k - late, 0), last)
         exposure, iso = session.logged_exposure_s(own), int(session.exposures.iso[own])
         numbers = [
             _logged_ns(stamp, options),

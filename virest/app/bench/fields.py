@@ -223,6 +223,15 @@ def _exposed_readout(rng: np.random.Generator, size: float) -> UnknownEffect:
     return UnknownEffect(hidden, expected=(_either(("delay", "row, exposure")),), exposures_s=exposures_s)
 
 
+def _late_exposures(rng: np.random.Generator, size: float) -> UnknownEffect:
+    """Exposures that change smoothly, logged one or two frames late or early."""
+    hidden = Hidden(exposures_late_frames=int(_sign(rng)) * (2 if size > 1 else 1))
+    period, phase = rng.uniform(9, 15), rng.uniform(0, 2 * np.pi)
+    exposures_s = 0.01 * (1 + 0.5 * np.sin(2 * np.pi * np.arange(FRAMES) / period + phase))
+    expected = (_either(("exposure_rows", "exposure")),)
+    return UnknownEffect(hidden, expected=expected, exposures_s=tuple(exposures_s.tolist()))
+
+
 def _drifting_bias(rng: np.random.Generator, size: float) -> UnknownEffect:
     """A gyroscope whose bias drifts from the given one: evenly, or settling as it warms up."""
     way, settling_s, kind = rng.normal(size=3), rng.uniform(0.8, 1.6), int(rng.integers(2))
@@ -303,6 +312,7 @@ EFFECTS: dict[str, Draw] = {
     "passing": _passing,
     "exposed_readout": _exposed_readout,
     "drifting_bias": _drifting_bias,
+    "late_exposures": _late_exposures,
 }
 NULL, NAMED_ONLY = "nothing", "named_only"
 CASES = {**EFFECTS, NULL: _nothing, NAMED_ONLY: _named_only}
