@@ -241,6 +241,20 @@ def test_a_deviation_includes_a_common_error_of_all_widths(altered: Observed) ->
     assert 0 < other.values[1][0] - one.values[1][0] < one.std[1]
 
 
+def test_widths_that_scatter_are_no_defocus(nominal: Observed, rng: np.random.Generator) -> None:
+    """A coder that lacks bits widens edges, each by another amount; a defocus widens all alike."""
+    observations, *rest = nominal
+    deviations = {}
+    for scatter in (0.05, 0.4):
+        widths = 1.3 * np.exp(rng.normal(0, scatter, len(observations.edges)))
+        wider = replace(observations, edges=replace(observations.edges, width_px=widths))
+        found = fit(wider, *rest, [Defocus()])
+        assert found.values[0][0] == pytest.approx(1.0, abs=0.2)
+        deviations[scatter] = found.values[0][0] / found.std[0]
+    assert deviations[0.05] > 6
+    assert deviations[0.4] < 3
+
+
 def test_the_profile_alone_describes_the_effects(altered: Observed) -> None:
     """Without any fit, the true profile has smaller residuals than the nominal one."""
     observations, profile, trajectory = altered
