@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
 from virest.arrays import Array
-from virest.inference.frame_delays import Turns, fit_frame_delays
+from virest.inference.frame_delays import LEAST, LEAST_NOISE, MOST, Turns, _System, fit_frame_delays
 
 FOCAL_PX, PERIOD_S = 800.0, 1 / 30
 
@@ -109,4 +110,21 @@ def test_points_that_tell_nothing_end_in_no_delays(rng: np.random.Generator) -> 
         assert found is not None
         assert found.p > 1e-3
         assert np.isfinite(found.late_s).all()
+        assert np.isfinite(found.std_s).all()
+
+
+@pytest.mark.parametrize("count", [12, 90, 600])
+def test_all_sizes_between_the_bounds_can_be_solved(rng: np.random.Generator, count: int) -> None:
+    """A gap in the log asks for noise and steps at their bounds; points in one corner hardly show one rotation."""
+    turns = turns_of(rng, np.zeros(count), walk_rad=1e-3)
+    turns.left_rad[count // 2 :] += 0.3
+    weak = turns.information.copy()
+    weak[:, 2, :], weak[:, :, 2] = 0.0, 0.0
+    weak[:, 2, 2] = 1e-9 * weak.trace(axis1=1, axis2=2)
+    for seen in (turns, replace(turns, information=weak)):
+        system = _System.of(seen, np.ones(count - 1, bool))
+        for sizes in product((LEAST_NOISE, MOST), (LEAST, MOST), (LEAST, MOST)):
+            assert np.isfinite(system._cost(np.array(sizes))), sizes
+        found = fit_frame_delays(seen)
+        assert found is not None
         assert np.isfinite(found.std_s).all()

@@ -46,9 +46,10 @@ UNIT_S = 1e-3
 """Unit of the delays within the fit."""
 START = np.array([0.0, -1.0, 0.0])
 """Logarithms of the sizes to start from: noise as the points', a third of it per step, delays of UNIT_S."""
-LEAST, LEAST_NOISE, MOST = -12.0, float(np.log(0.5)), 7.0
-"""Logarithms of sizes that are taken for 0, of the least noise, and of the largest size.  The points' noise is measured
-pair by pair without a model; where slow errors are large, these would replace it."""
+LEAST, LEAST_NOISE, MOST = -7.0, float(np.log(0.5)), 7.0
+"""Logarithms of sizes that are taken for 0 (a thousandth of the noise, a microsecond), of the least noise, and of the
+largest size.  The points' noise is measured pair by pair without a model; where slow errors are large, these would
+replace it.  Double precision solves systems of all sizes between: with e⁻¹² for 0, one lost its definiteness."""
 LOWER, COLUMNS = 4 * MOST_GAP + 3, 256
 """Diagonals below the main one; columns of the inverse that are computed at a time."""
 
