@@ -24,7 +24,14 @@ from virest.diagnosis.ambiguities import (
 from virest.diagnosis.edge_overshoot import judge_sharpening
 from virest.diagnosis.field.blur import blur_field
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
-from virest.diagnosis.field.brightness import instead_of_cause, light_field, with_light_field
+from virest.diagnosis.field.brightness import (
+    instead_of_flicker,
+    instead_of_gain,
+    light_field,
+    with_light_field,
+    without_flicker,
+    without_gain,
+)
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import (
@@ -35,11 +42,13 @@ from virest.diagnosis.findings import (
     FieldFinding,
     Finding,
     Nominal,
+    Rival,
 )
 from virest.diagnosis.followed_log import rows_late, with_followed_log, with_late_exposures, with_own_exposures_told
 from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.diagnosis.photometry_fit import fit_photometry
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve, light_varies
 from virest.diagnosis.refit_photometry import settle_light
 from virest.diagnosis.residual_tests import points_left, remaining_structure, residuals
@@ -199,6 +208,8 @@ class DiagnosisSession:
     each: ParallelMap = one_by_one
     kept_back: frozenset[int] = frozenset()
     """Movie indices of frames that only the photometric stage may use."""
+    instead_of: tuple[str, ...] = ()
+    """Causes that a map of the light replaces."""
     exposures_late_frames: int = 0
     """Rows by which the exposure table is off if that explains a delay of frames; known at the end."""
     _needs_fields_unlit: Callable[[], bool] | None = None
@@ -253,9 +264,43 @@ class DiagnosisSession:
                 start=with_flicker_of(start, self.light.profile),
             )
             self.geometric = self.points.climbed(progress)
-        self.geometric = self._with_fields(self.light.profile)
+        self.geometric = self._with_flicker_or_bands(progress)
         self.light = with_exposure_of(self.light, self.geometric.model.profile)
         self.findings = self._of_points(self.points.observed.exposure_s)
+
+    def _with_flicker_or_bands(self, progress: Callable[[float], None]) -> GeometricVerdict:
+        """The geometric verdict under this lighting; without a flicker that is none.
+
+        A map of the light that explains the patches as well replaces a phase-locked flicker.  Bands do so only if the
+        points contradict the flicker, which moves the mean time of each row's light: if they need fields with it, and
+        none or fewer without.  Otherwise they are a rival.
+        """
+        patches, lit = self.light.observations, self.light.profile
+        flicker = next((cause for cause in self.light.findings if cause.name == "flicker"), None)
+        found = None if flicker is None or patches is None else instead_of_flicker(patches, lit)
+        if flicker is None or patches is None or found is None:
+            return self._with_fields(lit)
+        under = self._with_fields(lit) if found.is_bands else self.geometric
+        own, unlit = self.points.start, without_flicker(lit)
+        if own.extensions.flicker_amplitude != unlit.extensions.flicker_amplitude:  # the points were climbed with it
+            points = replace(self.points, start=with_flicker_of(own, unlit))
+            plain = points.described(points.climbed(progress), unlit)
+        else:
+            points, plain = self.points, self._with_fields(unlit)
+        others = [cause for cause in self.light.findings if cause is not flicker]
+        if found.is_bands and len(under.fields) <= len(plain.fields):
+            told = replace(flicker, rivals=(*flicker.rivals, Rival("gain over row", found.held_out.after)))
+            self.light = replace(self.light, findings=[*others, told])
+            return under
+        self.points, fitted = points, self.light.fitted
+        if fitted is not None:
+            effects = [effect for effect in fitted.effects if effect.name != "flicker"]
+            fitted = fit_photometry(patches, unlit, effects) if effects else None
+        self.light = replace(
+            self.light, profile=unlit if fitted is None else fitted.profile, findings=others, fitted=fitted
+        )
+        self.instead_of = found.rivals
+        return plain
 
     def _of_points(self, exposure_s: Array) -> list[Finding]:
         found = offset_as_timestamp(self.geometric, findings_of(self.geometric), exposure_s)
@@ -338,11 +383,13 @@ class DiagnosisSession:
         fields = [self._with_late_exposures(field) for field in told]
         extended, light = self.curve.profile, self.light
         if (patches := light.observations) is not None:
-            name, without, instead = instead_of_cause(patches, extended, {finding.name for finding in findings})
+            drifts = any(finding.name == "gain_drift" for finding in findings)
+            instead = instead_of_gain(patches, extended) if drifts else None
             if instead is not None:
-                extended, light = without(extended), replace(light, profile=without(light.profile))
-                findings = [finding for finding in findings if finding.name != name]
+                extended, light = without_gain(extended), replace(light, profile=without_gain(light.profile))
+                findings = [finding for finding in findings if finding.name != "gain_drift"]
             if (found := instead or light_field(patches, extended)) is not None:
+                found = replace(found, rivals=(*found.rivals, *self.instead_of))
                 extended, fields = with_light_field(extended, found), [*fields, found.finding]
                 light = replace(light, profile=with_light_field(light.profile, found))
         if self.blur.edges is not None:

@@ -7,7 +7,6 @@ informative.  Where all patches move alike, a linear slope is indistinguishable 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +24,8 @@ from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 KNOTS, FINE_KNOTS = 4, 7
 """Knots along each side of a map: a cubic spline through 4 holds slope and vignetting, one through 7 follows 1.7
 periods to 10 % (rms)."""
+BAND_KNOTS, ACROSS_BAND = 16, 2
+"""Knots of bands along the readout, for 3.8 periods to 10 %: a light at 120 Hz in a readout of 30 ms; and across it."""
 FINER_LEFT = 0.98
 """A finer map must reduce the held-out residual of the coarser one below this fraction."""
 FRAMES_IN_BLOCK = 3
@@ -67,6 +68,11 @@ class LightField:
     """Named causes that the patches cannot distinguish from it."""
 
     @property
+    def is_bands(self) -> bool:
+        """Whether it follows the readout finely, as a flickering light does."""
+        return BAND_KNOTS in map(len, self.field.knots)
+
+    @property
     def finding(self) -> FieldFinding:
         """The finding in words."""
         size, std = _size(self.field)
@@ -94,31 +100,40 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile, g
         return None
     order = np.argsort(block, kind="stable")
     at = predict(seen, profile)
-    zero, basis = _form(profile)
-    design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
     left = at.residual / seen.noise
     weight = _weight(left)
     tangent = _tangent(seen, profile, at, gains) / seen.noise[:, None]
-    designs = [Design("gain", design[order, None], over_time=False)]
-    (scored, *_) = score_forms(left[order, None], weight[order], tangent[order, None], designs, block[order]) or (None,)
-    if scored is None or scored.parts_gain is None or scored.p_value > MAX_P:
-        return None
-    size = float(np.sqrt(max(scored.gain.sum(), 0.0) / weight.sum())) * float(np.median(seen.noise))
-    if min(t_ratio(scored.gain), t_ratio(scored.parts_gain)) < MIN_T or size < MIN_SIZE:
-        return None
+    forms: list[tuple[tuple[int, int], ...]] = [((KNOTS, KNOTS), (FINE_KNOTS, FINE_KNOTS)), (_bands(profile),)]
+    designs = []
+    for counts in forms:
+        zero, basis = _form(profile, counts[0])
+        design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
+        designs.append(Design("gain", design[order, None], over_time=False))
     best: LightField | None = None
-    for count in (KNOTS, FINE_KNOTS):
-        found = _fitted(seen, profile, at, tangent, weight, block, count, scored.p_value)
-        if best is None or found.held_out.after < FINER_LEFT * best.held_out.after:
-            best = found
+    scored = score_forms(left[order, None], weight[order], tangent[order, None], designs, block[order])
+    for one in sorted(scored, key=lambda one: one.index):
+        if one.parts_gain is None or one.p_value > MAX_P:
+            continue
+        size = float(np.sqrt(max(one.gain.sum(), 0.0) / weight.sum())) * float(np.median(seen.noise))
+        if min(t_ratio(one.gain), t_ratio(one.parts_gain)) < MIN_T or size < MIN_SIZE:
+            continue
+        for count in forms[one.index]:
+            found = _fitted(seen, profile, at, tangent, weight, block, count, one.p_value)
+            if best is None or found.held_out.after < FINER_LEFT * best.held_out.after:
+                best = found
     return best
+
+
+def _bands(profile: CameraProfile) -> tuple[int, int]:
+    """Knots along x and y of bands along the readout."""
+    return (BAND_KNOTS, ACROSS_BAND) if profile.shutter.reads_columns else (ACROSS_BAND, BAND_KNOTS)
 
 
 def _fitted(
     seen: PhotometricObservations, profile: CameraProfile, at: Prediction, tangent: Array, weight: Array, block: Index,
-    count: int, p_value: float,
+    count: tuple[int, int], p_value: float,
 ) -> LightField:  # fmt: skip
-    """The map with this many knots along each side."""
+    """The map with these numbers of knots along x and y."""
     zero, basis = _form(profile, count)
     if not profile.extensions.vignetting_corner_loss:
         # without vignetting in the profile, the map may contain its r² pattern
@@ -133,30 +148,22 @@ def _fitted(
     return LightField(field, p_value, _held_out(columns, design.shape[1], left, weight, block, seen))
 
 
-def instead_of_cause(
-    observations: PhotometricObservations, profile: CameraProfile, causes: Collection[str]
-) -> tuple[str, Callable[[CameraProfile], CameraProfile], LightField | None]:
-    """The cause that a map may replace, the profile without it, and the map; None for the map if none replaces it.
-
-    causes: names of the causes found; a gain or a flicker that the profile already had is kept.
-    """
-    if "gain_drift" in causes and (found := instead_of_gain(observations, profile)) is not None:
-        return "gain_drift", without_gain, found
-    instead = instead_of_flicker(observations, profile) if "flicker" in causes else None
-    return "flicker", without_flicker, instead
-
-
 def instead_of_flicker(observations: PhotometricObservations, profile: CameraProfile) -> LightField | None:
-    """The map that explains the patches at least as well as the profile's flicker, if the flicker is phase-locked.
+    """The map that explains the patches as well as the profile's flicker, if the flicker is phase-locked.
 
-    A light that flickers a whole number of cycles per frame looks like a fixed shadow over the rows.  None where the
-    phase drifts, or the flicker explains more.
+    A light that flickers a whole number of cycles per frame looks like a fixed shadow over the rows, or like bands that
+    belong to them; bands of several periods are as fine as a light's, so patches alone cannot tell them apart: they
+    need to remove nearly as much.  None where the phase drifts, or the flicker explains more.
     """
     seen = _thinned(observations)
     if not _is_phase_locked(seen, profile):
         return None
     found = light_field(observations, without_flicker(profile))
-    if found is None or found.held_out.after > _left_by(seen, profile):
+    if found is None:
+        return None
+    before, flickering = found.held_out.before**2, _left_by(seen, profile) ** 2
+    most_left = before - RIVAL_GAIN_FRACTION * (before - flickering) if found.is_bands else flickering
+    if found.held_out.after**2 > most_left:
         return None
     return replace(found, rivals=(f"flicker at {profile.extensions.flicker_frequency_hz:.4g} Hz",))
 
@@ -228,12 +235,13 @@ def _thinned(observations: PhotometricObservations) -> PhotometricObservations:
     return seen.subset(np.bincount(seen.patch)[seen.patch] >= 2)
 
 
-def _form(profile: CameraProfile, count: int = KNOTS) -> tuple[Field, Array]:
+def _form(profile: CameraProfile, count: tuple[int, int]) -> tuple[Field, Array]:
     """A zero map, and the basis of its free numbers: 0 at the centre (each patch's own light), without vignetting."""
-    knots = tuple(tuple(np.linspace(0.0, side - 1, count).tolist()) for side in (profile.width, profile.height))
+    sides = profile.width, profile.height
+    knots = tuple(tuple(np.linspace(0.0, side - 1, n).tolist()) for side, n in zip(sides, count, strict=True))
     x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
     radius2 = (x - 0.5 * (profile.width - 1)) ** 2 + (y - 0.5 * (profile.height - 1)) ** 2
-    field = Field("gain", ("x", "y"), knots, ((0.0,),) * count**2)
+    field = Field("gain", ("x", "y"), knots, ((0.0,),) * (count[0] * count[1]))
     return field, null_space(np.stack([_middle(field, profile), radius2 / np.linalg.norm(radius2)]))
 
 
