@@ -13,7 +13,12 @@ import pytest
 
 from virest.app.bench.diagnosis import diagnose_folder, errors_in_std
 from virest.app.simulate import simulate_command
+from virest.camera.response import ResponseCurve
+from virest.diagnosis.field.brightness import BAND
 from virest.diagnosis.findings import CONSISTENT, EXPLAINED, Diagnosis
+from virest.simulation.hidden import Hidden
+from virest.simulation.recording import RecordingOptions, write_recording
+from virest.simulation.session import SessionSettings, nominal_camera, plan_session
 
 pytestmark = pytest.mark.scenario
 
@@ -114,3 +119,25 @@ def test_exposures_logged_for_other_frames_are_the_only_finding(work: Path) -> N
     assert found.verdict == EXPLAINED
     assert found.extended_profile.extensions.exposures_late_frames == 2
     assert not found.extended_profile.extensions.field
+
+
+def test_bands_that_belong_to_the_rows_are_no_flicker(work: Path) -> None:
+    """Three dark bands in each frame at 30 frames/s look like a light at 120 Hz, whose rows the points contradict."""
+    nominal = nominal_camera(480, 360, focal_px=400.0, readout_time_s=0.024, response=ResponseCurve("srgb"))
+    settings = SessionSettings(scene="photographs", frames=60, exposure_s=(0.008,), rate_rad_s=1.1, seed=425)
+
+    def bands(part: np.ndarray) -> np.ndarray:
+        return np.asarray(1 + 0.06 * np.sin(6 * np.pi * part))
+
+    hidden = Hidden(light=lambda _x, y: bands(y))
+    session = plan_session(nominal, nominal, settings, hidden=hidden)
+    write_recording(session, work / "bands", options=RecordingOptions(bits_per_px=0.4, truth_frames=False))
+    found = diagnose_folder(work / "bands")
+    assert not found.causes
+    (field,) = found.fields
+    assert (field.kind, field.shape) == ("gain", BAND)
+    rows = np.linspace(20, 340, 81)
+    factor = 1 + field.fields[0].at(np.full(81, 240.0), rows)[..., 0]
+    off = np.log(factor / bands(rows / 360))
+    off -= np.polyval(np.polyfit(rows, off, 1), rows)  # patches that move alike do not show a slope
+    assert np.std(off) < 0.2 * np.std(bands(rows / 360))

@@ -28,6 +28,7 @@ from virest.diagnosis.ladder import diagnose_capture
 from virest.evaluation.fidelity import psnr_db
 from virest.inference.observed_tracks import observe_tracks
 from virest.inference.tracking import track_pairs
+from virest.restoration.capture import at_true_times
 from virest.simulation.effects import EffectContext, hide_effects
 from virest.simulation.hidden import NOTHING, Hidden
 from virest.simulation.recording import RecordingOptions, write_recording
@@ -375,9 +376,11 @@ def residuals_px(source: Source, profiles: list[CameraProfile]) -> tuple[list[fl
     capture = source.capture
     indices = [frame.index for frame in capture.frames if frame.skip_reason is None]
     pairs = track_pairs(source.gray(indices))
-    observed = observe_tracks(capture, pairs, source.profile).covered(capture.imu, source.profile)
-    evidence = make_evidence(capture.imu, observed)
-    ends = [climb(evidence, profile, (), (), max_rungs=0) for profile in profiles]
+    ends = []
+    for profile in profiles:
+        shown = replace(capture, frames=at_true_times(capture.frames, profile, capture.repeats))
+        observed = observe_tracks(shown, pairs, source.profile).covered(capture.imu, source.profile)
+        ends.append(climb(make_evidence(capture.imu, observed), profile, (), (), max_rungs=0))
     return [end.final_rms_px for end in ends], ends[-1].noise_px
 
 
