@@ -103,8 +103,12 @@ def diagnose_capture(
         return found
     further = profile.extensions.exposures_late_frames + session.exposures_late_frames
     own = profile.with_extensions(exposures_late_frames=further)
-    given = _climbed(capture, own, pictures, gray, report, each, frozenset(kept_back)).conclude()
-    return with_own_exposures_told(found, given, session.exposures_late_frames)
+
+    def again(text: str, part: float) -> None:
+        report(f"{text}, with the exposures of other rows", part)
+
+    corrected = _climbed(capture, own, pictures, gray, again, each, frozenset(kept_back)).conclude()
+    return with_own_exposures_told(found, corrected, session.exposures_late_frames)
 
 
 def _climbed(
