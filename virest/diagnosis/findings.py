@@ -90,7 +90,7 @@ class FieldFinding:
 
     covariates: tuple[str, ...]
     kind: str
-    """As of :mod:`virest.camera.field`, or ``inertial_rows``."""
+    """As of :mod:`virest.camera.field`, ``inertial_rows`` or ``exposure_rows``."""
     shape: str
     sentence: str
     """What it does, for people."""
