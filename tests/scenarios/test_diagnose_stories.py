@@ -98,21 +98,20 @@ def test_an_uncatalogued_fault_is_described(work: Path) -> None:
     assert field.held_out.after < 1.5 * field.held_out.noise < 0.1 * field.held_out.before
 
 
+def _diagnosed(folder: Path, hidden: Hidden, seed: int, exposures_s: tuple[float, ...]) -> Diagnosis:
+    """The diagnosis of a capture whose phone has a hidden fault; at 120 Hz, its readout lasts three periods."""
+    nominal = nominal_camera(480, 360, focal_px=400.0, readout_time_s=0.025, response=ResponseCurve("srgb"))
+    settings = SessionSettings(scene="photographs", frames=60, exposure_s=exposures_s, rate_rad_s=1.1, seed=seed)
+    options = RecordingOptions(bits_per_px=0.4, truth_frames=False)
+    write_recording(plan_session(nominal, nominal, settings, hidden=hidden), folder, options=options)
+    return diagnose_folder(folder)
+
+
 def test_exposures_logged_for_other_frames_are_the_only_finding(work: Path) -> None:
     """Neither stamps that jitter nor brightness that drifts; the extended profile gives each frame its own exposure."""
-    exposures_ms = (10 * (1 + 0.5 * np.sin(np.arange(60) / 2))).tolist()
-    folder = _capture(work, "late_exposures", [], 424, frames=60, exposure_ms=exposures_ms)
-    table = folder / "movie_metadata.csv"
-    head, *rows = [line.split(",") for line in table.read_text().splitlines()]
-    shifted = [*([rows[0]] * 2), *rows[:-2]]
-    logged = [head.index(name) for name in ("Exposure time[nanosec]", "ISO")]
-    lines = [
-        [late[k] if k in logged else own[k] for k in range(len(head))] for own, late in zip(rows, shifted, strict=True)
-    ]
-    table.write_text("\n".join(map(",".join, [head, *lines])) + "\n")
-    found = diagnose_folder(folder)
+    exposures_s = tuple((0.01 * (1 + 0.5 * np.sin(np.arange(60) / 2))).tolist())
+    found = _diagnosed(work / "late_exposures", Hidden(exposures_late_frames=2), 424, exposures_s)
     assert not found.causes
-    print([f.sentence for f in found.fields], found.unexplained)
     (field,) = found.fields
     assert (field.kind, field.size) == ("exposure_rows", 2.0)
     assert "logged 2 frames late" in field.sentence
@@ -122,20 +121,19 @@ def test_exposures_logged_for_other_frames_are_the_only_finding(work: Path) -> N
 
 
 def test_bands_that_belong_to_the_rows_are_no_flicker(work: Path) -> None:
-    """Three dark bands in each frame at 30 frames/s look like a light at 120 Hz, whose rows the points contradict."""
-    nominal = nominal_camera(480, 360, focal_px=400.0, readout_time_s=0.024, response=ResponseCurve("srgb"))
-    settings = SessionSettings(scene="photographs", frames=60, exposure_s=(0.008,), rate_rad_s=1.1, seed=425)
+    """Three dark bands at 30 frames/s look like a light at 120 Hz, strong since an exposure nearly averages it out.
+
+    Such a light would move the mean time of each row, which the points contradict.
+    """
 
     def bands(part: np.ndarray) -> np.ndarray:
         return np.asarray(1 + 0.06 * np.sin(6 * np.pi * part))
 
-    hidden = Hidden(light=lambda _x, y: bands(y))
-    session = plan_session(nominal, nominal, settings, hidden=hidden)
-    write_recording(session, work / "bands", options=RecordingOptions(bits_per_px=0.4, truth_frames=False))
-    found = diagnose_folder(work / "bands")
+    found = _diagnosed(work / "bands", Hidden(light=lambda _x, y: bands(y)), 425, (0.0077,))
     assert not found.causes
     (field,) = found.fields
     assert (field.kind, field.shape) == ("gain", BAND)
+    assert "flicker at 120 Hz" in field.confounded
     rows = np.linspace(20, 340, 81)
     factor = 1 + field.fields[0].at(np.full(81, 240.0), rows)[..., 0]
     off = np.log(factor / bands(rows / 360))

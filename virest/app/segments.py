@@ -285,7 +285,10 @@ def _write_frame(segment: Segment, restored: RestoredFrame, decode_s: float) -> 
 def _require_unfinished(run: RunFolder) -> None:
     """Raise OutputError if the run has ended, so that a worker that outlived its cluster leaves the folder alone."""
     if not is_remote(run.path) and not run.segments.is_dir():
-        raise OutputError(f"{run.path}: the run has ended without this worker", hint="nothing to do: stop the worker")
+        raise OutputError(
+            f"{run.path}: the unfinished run is no longer there: it has ended elsewhere, or was removed",
+            hint="if it was removed, start it again",
+        )
 
 
 def recorded_mask(picture: Picture, source_px: NDArray[np.float32] | None) -> Picture:

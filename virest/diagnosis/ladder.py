@@ -284,7 +284,6 @@ class DiagnosisSession:
         found = None if flicker is None or patches is None else instead_of_flicker(patches, lit)
         if flicker is None or patches is None or found is None:
             return self._with_fields(lit)
-        under = self._with_fields(lit) if found.is_bands else self.geometric
         own, unlit = self.points.start, without_flicker(lit)
         if own.extensions.flicker_amplitude != unlit.extensions.flicker_amplitude:  # the points were climbed with it
             points = replace(self.points, start=with_flicker_of(own, unlit))
@@ -292,7 +291,7 @@ class DiagnosisSession:
         else:
             points, plain = self.points, self._with_fields(unlit)
         others = [cause for cause in self.light.findings if cause is not flicker]
-        if found.is_bands and len(under.fields) <= len(plain.fields):
+        if found.is_bands and len((under := self._with_fields(lit)).fields) <= len(plain.fields):
             told = replace(flicker, rivals=(*flicker.rivals, Rival("gain over row", found.held_out.after)))
             self.light = replace(self.light, findings=[*others, told])
             return under

@@ -25,7 +25,8 @@ KNOTS, FINE_KNOTS = 4, 7
 """Knots along each side of a map: a cubic spline through 4 holds slope and vignetting, one through 7 follows 1.7
 periods to 10 % (rms)."""
 BAND_KNOTS, ACROSS_BAND = 16, 2
-"""Knots of bands along the readout, for 3.8 periods to 10 %: a light at 120 Hz in a readout of 30 ms; and across it."""
+"""Knots of bands along the readout, for 3.8 periods to 10 %: a light at 120 Hz in a readout of 30 ms; and across it,
+where bands do not change."""
 FINER_LEFT = 0.98
 """A finer map must reduce the held-out residual of the coarser one below this fraction."""
 FRAMES_IN_BLOCK = 3
@@ -70,7 +71,7 @@ class LightField:
     @property
     def is_bands(self) -> bool:
         """Whether it follows the readout finely, as a flickering light does."""
-        return BAND_KNOTS in map(len, self.field.knots)
+        return _is_bands(self.field)
 
     @property
     def finding(self) -> FieldFinding:
@@ -106,7 +107,8 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile, g
     forms: list[tuple[tuple[int, int], ...]] = [((KNOTS, KNOTS), (FINE_KNOTS, FINE_KNOTS)), (_bands(profile),)]
     designs = []
     for counts in forms:
-        zero, basis = _form(profile, counts[0])
+        zero = _zero_map(profile, counts[0])
+        basis = _basis(zero, profile, vignetted=True)
         design = -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
         designs.append(Design("gain", design[order, None], over_time=False))
     best: LightField | None = None
@@ -134,10 +136,10 @@ def _fitted(
     count: tuple[int, int], p_value: float,
 ) -> LightField:  # fmt: skip
     """The map with these numbers of knots along x and y."""
-    zero, basis = _form(profile, count)
-    if not profile.extensions.vignetting_corner_loss:
-        # without vignetting in the profile, the map may contain its r² pattern
-        basis, tangent = null_space(_middle(zero, profile)[None]), tangent[:, 1:]
+    zero, vignetted = _zero_map(profile, count), bool(profile.extensions.vignetting_corner_loss)
+    basis = _basis(zero, profile, vignetted)
+    if not vignetted:  # the map may contain its r² pattern
+        tangent = tangent[:, 1:]
     left, design = at.residual / seen.noise, -at.respond(_weights(zero, seen) @ basis) / seen.noise[:, None]
     columns = np.concatenate([design, tangent], axis=1)
     numbers, covariance = _solved(columns, left, weight, block, design.shape[1])
@@ -235,14 +237,30 @@ def _thinned(observations: PhotometricObservations) -> PhotometricObservations:
     return seen.subset(np.bincount(seen.patch)[seen.patch] >= 2)
 
 
-def _form(profile: CameraProfile, count: tuple[int, int]) -> tuple[Field, Array]:
-    """A zero map, and the basis of its free numbers: 0 at the centre (each patch's own light), without vignetting."""
+def _zero_map(profile: CameraProfile, count: tuple[int, int]) -> Field:
+    """A map of zeros with these numbers of knots along x and y."""
     sides = profile.width, profile.height
     knots = tuple(tuple(np.linspace(0.0, side - 1, n).tolist()) for side, n in zip(sides, count, strict=True))
-    x, y = (a.ravel() for a in np.meshgrid(*knots, indexing="ij"))
+    return Field("gain", ("x", "y"), knots, ((0.0,),) * (count[0] * count[1]))
+
+
+def _basis(field: Field, profile: CameraProfile, vignetted: bool) -> Array:
+    """(knots, n) basis of a map's free numbers: 0 at the centre (each patch's own light); bands are even across.
+
+    vignetted: without the r² pattern of a vignetting, which has a number of its own.
+    """
+    x, y = (a.ravel() for a in np.meshgrid(*field.knots, indexing="ij"))
     radius2 = (x - 0.5 * (profile.width - 1)) ** 2 + (y - 0.5 * (profile.height - 1)) ** 2
-    field = Field("gain", ("x", "y"), knots, ((0.0,),) * (count[0] * count[1]))
-    return field, null_space(np.stack([_middle(field, profile), radius2 / np.linalg.norm(radius2)]))
+    tied = np.eye(len(x))
+    if _is_bands(field):
+        along, across = (x, y) if profile.shutter.reads_columns else (y, x)
+        tied = (along[:, None] == along[across == 0.0]).astype(float)
+    fixed = [_middle(field, profile), radius2 / np.linalg.norm(radius2)][: 1 + vignetted]
+    return np.asarray(tied @ null_space(np.stack(fixed) @ tied))
+
+
+def _is_bands(field: Field) -> bool:
+    return BAND_KNOTS in map(len, field.knots)
 
 
 def _middle(field: Field, profile: CameraProfile) -> Array:
