@@ -118,6 +118,10 @@ class Field:
         time_s = np.asarray(time_s, float)
         return self.at(*first, time_s if self.log is None else np.interp(time_s, *self.log))
 
+    def std_over_time(self, time_s: Array) -> Array:
+        """Standard deviations (n, components) of a field over time, linear between its knots and 0 beyond them."""
+        return np.stack([np.interp(time_s, self.knots[0], std, 0.0, 0.0) for std in np.array(self.std).T], -1)
+
     def undisplaced(self, points_px: Array) -> Array:
         """Positions without displacement of points seen at pixels (..., 2): q + u(q) = p."""
         points_px = np.asarray(points_px, float)

@@ -137,8 +137,13 @@ class CameraProfile:
 
     def bridges(self, from_s: float, to_s: float) -> bool:
         """Whether a field of the rate over time bridges exactly this stretch of the inertial log."""
-        knots = [f.knots[0] for f in self.extensions.field if f.kind == "rate" and f.covariates == ("time",)]
+        knots = (field.knots[0] for field in self.rates_over_time)
         return any(max(abs(k[0] - from_s), abs(k[-1] - to_s)) < BRIDGE_SLACK_S for k in knots)
+
+    @property
+    def rates_over_time(self) -> tuple[ModelField, ...]:
+        """Fields of the rate over time: bridges of untrusted stretches, and biases that drift."""
+        return tuple(f for f in self.extensions.field if f.kind == "rate" and f.covariates == ("time",))
 
     def with_fields(self, fields: Sequence[ModelField]) -> CameraProfile:
         """The profile with exactly these fields. Raises SettingsError for two fields of a kind that must be unique."""

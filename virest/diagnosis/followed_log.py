@@ -140,7 +140,7 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, rows: int) -> Di
         "px): with its own, each frame is where the points are"
     )
     told = FieldFinding(
-        ("exposure",), TABLE, f"{rows} rows", sentence, float(rows), "frames", None, gain, delay.p_value, (), None,
+        ("exposure",), TABLE, rows_apart(rows), sentence, float(rows), "frames", None, gain, delay.p_value, (), None,
         "a recorder that joins two queues, or an encoder that drops its first frames",
         "film a lamp that is switched on, and compare the row of the jump with the frame of the jump",
     )  # fmt: skip

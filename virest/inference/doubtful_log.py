@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from virest.arrays import Mask
+from virest.arrays import Array, Mask
 from virest.capture.imu import ImuSamples
 
 STRAIGHT, CLIPPED, CONTRADICTED = "straight", "clipped", "contradicted"
@@ -20,12 +20,16 @@ CHANCE = 1e-6
 """False-alarm probability of a straight run in the log, from the rate of such differences on the three axes."""
 LEAST_STRAIGHT_S = 0.02
 """Shortest straight run that is doubted."""
-PILE_PART, LEAST_PILED, PILED_RUN = 0.005, 6, 3
-"""Readings within PILE_PART of the largest are at the limit; clipping needs LEAST_PILED of them in all, with a run of
-PILED_RUN."""
+PILES = ((0.005, 1), (0.01, 3), (0.02, 3), (0.04, 3))
+"""Readings within such a part of the largest are at the limit if that many swings reach it.  Noise after the limit
+spreads them; the top of one swing may be as flat as that, the tops of three are not equally high."""
+LEAST_PILED, PILED_RUN = 6, 3
+"""Clipping needs LEAST_PILED readings at the limit in all, with a run of PILED_RUN."""
 PILE_RATIO = 4.0
-"""Smallest ratio of the readings at the limit to those in an equally wide band below; for an unclipped peak it is
-lower."""
+"""Smallest ratio of the readings at the limit to those in an equally wide band below: 2.4 for the top of an unclipped
+swing, whatever the width."""
+LEAST_LIMIT = 0.5
+"""Smallest largest reading one way, over that of both ways: an axis that hardly turns that way reaches no limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +43,7 @@ class Stretch:
     to_s: float
     axes: tuple[int, ...]
     limit_rad_s: float | None = None
-    """Largest reading of a clipped axis."""
+    """Limit of a clipped axis: the median of its readings there."""
     p_value: float | None = None
     """Probability per capture that points contradict an interval like this by chance; None: the log shows it."""
 
@@ -71,17 +75,34 @@ def _straight(imu: ImuSamples) -> list[Stretch]:
 
 
 def _clipped(imu: ImuSamples, axis: int) -> list[Stretch]:
-    """Runs of readings at the axis's largest value, if readings accumulate there."""
-    size = np.abs(imu.gyro_rad_s[:, axis])
-    limit = float(size.max())
-    at_limit: Mask = np.asarray(size >= (1 - PILE_PART) * limit)
-    below = int(((size >= (1 - 2 * PILE_PART) * limit) & ~at_limit).sum())
-    runs = _runs(at_limit)
-    longest = max((last - first + 1 for first, last in runs), default=0)
-    if at_limit.sum() < max(LEAST_PILED, PILE_RATIO * (below + 1)) or longest < PILED_RUN:
-        return []
-    time_s, end = imu.time_s.tolist(), len(size) - 1
-    return [Stretch(CLIPPED, time_s[max(a - 1, 0)], time_s[min(b + 1, end)], (axis,), limit) for a, b in runs]
+    """Runs of readings at the axis's largest value one way or the other, if readings accumulate there."""
+    rate, time_s, end = imu.gyro_rad_s[:, axis], imu.time_s.tolist(), len(imu) - 1
+    found = []
+    for reading in (rate, -rate):
+        at_limit = _at_limit(reading, LEAST_LIMIT * float(np.abs(rate).max()))
+        limit = float(np.median(reading[at_limit])) if at_limit.any() else None
+        found += [
+            Stretch(CLIPPED, time_s[max(first - 1, 0)], time_s[min(last + 1, end)], (axis,), limit)
+            for first, last in _runs(at_limit)
+        ]
+    return found
+
+
+def _at_limit(reading: Array, least: float) -> Mask:
+    """Which readings (n,) accumulate at the largest, in the narrowest pile; none if the largest is below ``least``."""
+    limit, none = float(reading.max()), np.zeros(len(reading), bool)
+    if limit <= least:
+        return none
+    swings = _runs(np.asarray(reading > limit / 2))
+    for part, least_swings in PILES:
+        at_limit: Mask = np.asarray(reading >= (1 - part) * limit)
+        below = int((reading >= (1 - 2 * part) * limit).sum() - at_limit.sum())
+        longest = max(last - first + 1 for first, last in _runs(at_limit))
+        reached = sum(bool(at_limit[first : last + 1].any()) for first, last in swings)
+        piled = at_limit.sum() >= max(LEAST_PILED, PILE_RATIO * (below + 1))
+        if piled and longest >= PILED_RUN and reached >= least_swings:
+            return at_limit
+    return none
 
 
 def _runs(mask: Mask) -> list[tuple[int, int]]:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from virest.arrays import Array, Mask
-from virest.camera.field import AXES, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Capture
 from virest.diagnosis.cross_validation import JUDGE_POINTS
@@ -22,7 +21,7 @@ from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.stretches import bridging_form, rate_walk, touching
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, fit_model, make_evidence
 from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
-from virest.image_formation.point_model import TrackTable, integrate_motion, seen_s
+from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.inference.chance import chance_of_larger
 from virest.inference.comparable_noise import noise_distances
 from virest.inference.doubtful_log import CONTRADICTED, Stretch, doubtful_stretches
@@ -37,8 +36,6 @@ MAX_P = 1e-3
 MAX_EXCESS_LEFT, MAX_RMS_RATIO = 0.2, 1.5
 """Accept a bridge if less than MAX_EXCESS_LEFT of the excess squared residual remains, or if the residual rms is below
 MAX_RMS_RATIO times the noise."""
-MAX_BLUR_STD_PX = 0.5
-"""Reject a bridge whose rate uncertainty exceeds this in blur-path length; its frames are then not corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +159,6 @@ def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) ->
     covariance = found.fit.covariance[part_of, part_of]
     std = form.filled(np.zeros(len(covariance)), covariance)
     fields = [replace(form.held_in(profile, own), std=own.std) for own in std]
-    usable = tested.holds & (blur_std_px(found.fit, found.table, form, covariance) < MAX_BLUR_STD_PX)
     untrusted = tuple((s.from_s, s.to_s) for s in stretches)
     profile = replace(profile, imu_untrusted_s=untrusted, imu_untrusted_stamp_0_ns=capture.stamp_0_ns)
     found.model = replace(found.model, profile=profile)
@@ -172,7 +168,7 @@ def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) ->
             Distrusted(
                 tuple(stretches[k] for k in of_kind),
                 tuple(fields[k] for k in of_kind),
-                tuple(bool(usable[k]) for k in of_kind),
+                tuple(bool(tested.holds[k]) for k in of_kind),
                 p_value,
                 *map(float, tested.rms_px(np.asarray(tested.near[of_kind].any(axis=0)))),
             )
@@ -220,17 +216,18 @@ class HeldOutBridges:
         return np.array([_convicted(before, after, usual_px) for before, after, _ in found])
 
     def p_value(self, kind: str) -> float | None:
-        """Of residuals near the intervals of a kind being no larger than elsewhere; None if no pair lies elsewhere."""
-        stretches = self.bridges.doubtful.stretches
+        """Of residuals near the intervals of a kind being no larger than elsewhere; None without such points.
+
+        If fewer than LEAST_PAIRS_LEFT pairs lie elsewhere, the residuals with bridges take their place.
+        """
+        stretches, elsewhere = self.bridges.doubtful.stretches, ~self.bridges.doubtful.hit
         if kind == CONTRADICTED:
             return min(stretch.p_value for stretch in stretches if stretch.p_value is not None)
-        if self.bridges.doubtful.hit.all():
-            return None
-        return _larger_residual_p(
-            pair_medians(self.before, self.table, self.near.shape[1]),
-            np.asarray(self.near[[stretch.kind == kind for stretch in stretches]].any(axis=0)),
-            self.bridges.doubtful.hit,
-        )
+        before, after = (pair_medians(d, self.table, self.near.shape[1]) for d in (self.before, self.after))
+        near = np.asarray(self.near[[stretch.kind == kind for stretch in stretches]].any(axis=0))
+        enough = (elsewhere & np.isfinite(before)).sum() >= LEAST_PAIRS_LEFT
+        p_value = _larger_p(before[near], before[elsewhere] if enough else after[near])
+        return p_value if np.isfinite(p_value) else None
 
 
 def _to_imu(profile: CameraProfile) -> tuple[float, float]:
@@ -258,27 +255,6 @@ def _refit(found: GeometricVerdict, evidence: Evidence, start: Model, terms: Seq
     found.noise_px = evidence.noise_px(fitted)
 
 
-def blur_std_px(fitted: TrackFit, table: TrackTable, form: FieldForm, covariance: Array) -> Array:
-    """Largest standard deviation (bridges,) of the blur-path length of a point seen in a bridge, px.
-
-    Rates between two frames' exposures are uncertain but blur nothing.
-    """
-    profile, lens = fitted.profile, fitted.profile.intrinsics
-    assert lens is not None
-    exposure_s = np.asarray(profile.shutter.true_exposure_s(table.second_exposure_s))
-    middles_s = np.stack([seen_s(profile, table.first_px, table.first_stamp_s, table.first_exposure_s), fitted.seconds])
-    seen = np.unique(np.round(middles_s[:, None] + np.multiply.outer((-0.5, 0.0, 0.5), exposure_s), 3))
-    ends = np.cumsum([np.size(field.values) for field in form.fields])[:-1]
-    found = []
-    for field, basis in zip(form.fields, np.split(form.basis, ends), strict=True):
-        knots = field.knots[0]
-        weight = cardinal_weights(knots, seen[(seen > knots[0]) & (seen < knots[-1])])
-        moved = np.einsum("tk,kan->tan", weight, basis.reshape(len(knots), len(AXES), -1))
-        variance = np.einsum("tan,nm,tam->t", moved, covariance, moved)
-        found.append(float(np.sqrt(variance.max(initial=0.0))))
-    return np.array(found) * float(np.median(exposure_s)) * lens.fx_px
-
-
 def _holds(before: float, after: float, noise: float) -> bool:
     """Whether bridging leaves the points in an interval their noise, or removes most of their excess residual."""
     return after < MAX_RMS_RATIO * noise or _removes_excess(before, after, noise)
@@ -301,10 +277,10 @@ def pair_medians(distance: Array, table: TrackTable, pairs: int) -> Array:
     return medians
 
 
-def _larger_residual_p(medians: Array, inside: Mask, hit: Mask) -> float:
-    """p value of the residuals inside being no larger than those of pairs not hit: t test on log medians per pair.
+def _larger_p(medians: Array, others: Array) -> float:
+    """p value of pairs' median residuals being no larger than other pairs': t test on their logarithms.
 
-    A rank test would ignore how far a few outlying pairs deviate.
+    A rank test would ignore how far a few outlying pairs deviate.  nan: a pair without points.
     """
-    size, known = np.log(np.maximum(medians, np.finfo(float).tiny)), np.isfinite(medians)
-    return chance_of_larger(size[inside & known], size[~hit & known])
+    first, second = (np.log(np.maximum(m[np.isfinite(m)], np.finfo(float).tiny)) for m in (medians, others))
+    return chance_of_larger(first, second)

@@ -46,7 +46,7 @@ class Distrusted:
     bridges: tuple[Field, ...]
     """Rates there, estimated from the points, with standard deviations."""
     usable: tuple[bool, ...]
-    """Whether these rates explain the points and are accurate enough to restore frames."""
+    """Whether these rates explain the points."""
     p_value: float | None
     """For the hypothesis that residuals there are no larger than elsewhere; None: all pairs are affected."""
     before_px: float
@@ -58,5 +58,5 @@ class Distrusted:
 
     @property
     def withheld(self) -> tuple[Field, ...]:
-        """Bridges that join the motion on both sides of their interval, but are not accurate enough inside."""
+        """Bridges that join the motion on both sides of their interval, but do not explain the points inside."""
         return tuple(field for field, usable in zip(self.bridges, self.usable, strict=True) if not usable)

@@ -46,6 +46,8 @@ cancels only slow rotation is no function of the rate, and a fit of two values a
 """
 NODE_S = 0.004
 """Spacing, s, of the nodes between which the missing rate is linear: hands shake at up to about 12 Hz."""
+RATE_STEPS = 33
+"""Times in a frame at which the uncertainty of a rate is read: about 1 ms apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +163,23 @@ class RefinedMotion:
             return 0.0
         per_exposure_px = np.sqrt(np.trace(self.path_covariance_px2()) / 2)
         return float(per_exposure_px * _rms_from_reference_s(self.motion) / exposure_s)
+
+
+def with_uncertain_rates(refined: RefinedMotion | None, motion: RowMotion) -> RefinedMotion | None:
+    """A frame's motion with the uncertainty of the profile's fields of the rate over time, averaged over its rows.
+
+    Such a field bridges a stretch of the log; one that the frame's exposures do not reach adds nothing.  The error is
+    taken to last for the exposure, since a bridge's knots are about as far apart.
+    """
+    profile, time_s, variance = motion.profile, np.linspace(motion.start_s, motion.end_s, RATE_STEPS), np.zeros(3)
+    for field in profile.rates_over_time:
+        if field.std and field.knots[0][0] < motion.end_s and field.knots[0][-1] > motion.start_s:
+            variance += np.mean(field.std_over_time(time_s) ** 2, axis=0)
+    if not variance.any():
+        return refined
+    refined = refined or RefinedMotion(motion, np.zeros((3, 3)), 0.0)
+    of_camera = profile.rotation_cam_imu * variance @ profile.rotation_cam_imu.T
+    return replace(refined, rate_covariance=refined.rate_covariance + of_camera)
 
 
 def missing_turn(
