@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -127,3 +128,25 @@ def test_a_bad_folder_is_reported_in_few_lines(virest_here, tmp_path: Path) -> N
     assert done.returncode == 4
     assert "also missing: movie.mp4, frame_timestamps.txt, movie_metadata.csv" in done.stdout
     assert len(done.stdout.splitlines()) <= 6
+
+
+def test_a_log_that_looks_clipped_is_named_before_processing(swing: Path, virest_here, tmp_path: Path) -> None:
+    """`inspect` and `process` say at which rate, and which command tests it."""
+    folder = tmp_path / "clipped"
+    shutil.copytree(swing, folder)
+    log = folder / "gyro_accel.csv"
+    head, *rows = log.read_text(encoding="utf-8").splitlines()
+    cells = [row.split(",") for row in rows]
+    limit = 0.6 * max(abs(float(row[1])) for row in cells)
+    for row in cells:
+        row[1] = f"{min(max(float(row[1]), -limit), limit):.7g}"
+    log.write_text("\n".join([head, *map(",".join, cells)]) + "\n", encoding="utf-8")
+    said = f"the gyroscope log looks clipped at {limit:.3g} rad/s"
+    notes = json.loads(virest_here("inspect", folder, "--json").stdout)["notes"]
+    assert [note["severity"] for note in notes if note["text"].startswith(said)] == ["warning"]
+    assert not any(
+        "looks" in note["text"] for note in json.loads(virest_here("inspect", swing, "--json").stdout)["notes"]
+    )
+    planned = virest_here("process", folder, "--dry-run", "--preset", "fast")
+    assert said in planned.stderr
+    assert "virest diagnose" in planned.stderr

@@ -14,6 +14,7 @@ from virest.capture.folder import EPOCHS, Capture, Frame, Note, read_capture, re
 from virest.capture.join import median_period_s
 from virest.capture.video import MovieIndex
 from virest.errors import CaptureError, VirestError
+from virest.inference.doubtful_log import doubts
 
 DROPPED = " dropped: "
 NOT_APPLIED_S = 1e-6
@@ -37,6 +38,7 @@ def as_json(capture: Capture) -> dict[str, Any]:
     frame_period, imu_period = median_period_s(frame_s), median_period_s(capture.imu.time_s)
     logged = capture.metadata
     profile_source, profile_notes = _profile_source(capture)
+    log_notes = [Note("warning", "inertial-log", text) for text in doubts(capture.imu)]
     return {
         "capture": capture.name,
         "folder": str(capture.folder),
@@ -71,7 +73,7 @@ def as_json(capture: Capture) -> dict[str, Any]:
         "accelerometer": capture.imu.has_accelerometer,
         "peak_rate_rad_s": float(np.linalg.norm(capture.imu.gyro_rad_s, axis=1).max()),
         "profile": profile_source,
-        "notes": [_note(note) for note in (*capture.notes, *profile_notes)],
+        "notes": [_note(note) for note in (*capture.notes, *profile_notes, *log_notes)],
     }
 
 

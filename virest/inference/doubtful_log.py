@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from virest.arrays import Array, Mask
+from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 
 STRAIGHT, CLIPPED, CONTRADICTED = "straight", "clipped", "contradicted"
@@ -54,6 +55,22 @@ def doubtful_stretches(imu: ImuSamples) -> list[Stretch]:
         return []
     found = [*_straight(imu), *(s for axis in range(3) for s in _clipped(imu, axis))]
     return sorted(found, key=lambda s: s.from_s)
+
+
+def doubts(imu: ImuSamples, profile: CameraProfile | None = None) -> list[str]:
+    """What a log's implausible stretches look like, one line per kind, without those that a profile bridges."""
+    lines = []
+    found = [s for s in doubtful_stretches(imu) if profile is None or not profile.bridges(s.from_s, s.to_s)]
+    for kind in (CLIPPED, STRAIGHT):
+        stretches = [stretch for stretch in found if stretch.kind == kind]
+        if not stretches:
+            continue
+        limits = [stretch.limit_rad_s for stretch in stretches if stretch.limit_rad_s is not None]
+        look = f"clipped at {np.median(limits):.3g} rad/s" if limits else "interpolated across a gap"
+        count, first_s = len(stretches), stretches[0].from_s
+        where = f"in {count} stretches, the first from {first_s:.2f} s" if count > 1 else f"from {first_s:.2f} s"
+        lines.append(f"the gyroscope log looks {look} {where}: virest diagnose")
+    return lines
 
 
 def _straight(imu: ImuSamples) -> list[Stretch]:

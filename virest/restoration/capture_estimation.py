@@ -23,6 +23,7 @@ from virest.image_formation.row_clock import RowClock
 from virest.image_formation.row_motion import FrameTranslation, frame_times_s
 from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
 from virest.inference.coarse_alignment import MIN_EXPLAINED, STEP_S, align_coarsely
+from virest.inference.doubtful_log import doubts
 from virest.inference.frame_selection import choose_pairs
 from virest.inference.guide_choice import find_guide
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
@@ -413,8 +414,8 @@ def resting_points(lens: MovingLens, profile: CameraProfile, frame: Frame, point
 
 
 def _default_notes(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
-    """A note for each unknown value, which is set to its documented default."""
-    notes = []
+    """A note for each unknown value, which is set to its documented default, and on a log that looks wrong."""
+    notes = [PlanNote(NoteCode.DOUBTFUL_LOG, text) for text in doubts(capture.imu, profile)]
     if profile.response is None:
         notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "exposure curve unknown: srgb assumed"))
     if not profile.readout_known:

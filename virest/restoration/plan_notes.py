@@ -11,6 +11,8 @@ class NoteCode(Enum):
 
     DEFAULT_TAKEN = auto()
     """A value missing in the profile is set to its documented default."""
+    DOUBTFUL_LOG = auto()
+    """The inertial log itself shows stretches that do not look like a gyroscope's."""
     TIME_OFFSET = auto()
     """The offset, missing in the profile, was estimated, or why it was not."""
     NOT_FOLLOWING = auto()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from laws import TurningCamera, phone
 
+from virest.camera.field import Field
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.refinement import (
     NEGLIGIBLE_PX,
@@ -19,6 +20,7 @@ from virest.restoration.neighbours.refinement import (
     missing_turn,
     undetected_rad_s,
     with_bias,
+    with_uncertain_rates,
 )
 from virest.restoration.neighbours.registration import PairTurn
 
@@ -165,6 +167,37 @@ def test_position_uncertainty_follows_from_speed_uncertainty() -> None:
     off_px = speed_px_s * (middles_s - motion.reference_s)
     assert refined.position_std_px() == pytest.approx(np.sqrt(np.mean(off_px**2)), rel=1e-3)
     assert RefinedMotion(motion, np.zeros((3, 3)), 0.0).position_std_px() == 0.0
+
+
+def test_an_uncertain_rate_makes_the_path_of_its_rows_uncertain() -> None:
+    """A rate that is uncertain by σ for all rows moves the path's end by f σ exposure; outside the rows by nothing."""
+    motion = TurningCamera(phone()).motion
+    lens = motion.profile.intrinsics
+    assert lens is not None
+
+    def std_px(from_s: float, to_s: float) -> float:
+        knots = tuple(np.linspace(from_s, to_s, 4).tolist())
+        bridge = Field("rate", ("time",), (knots,), ((0.0,) * 3,) * 4, ((0.1,) * 3,) * 4)
+        bridged = replace(motion, profile=motion.profile.with_extensions(field=(bridge,)))
+        found = with_uncertain_rates(None, bridged)
+        return 0.0 if found is None else float(np.sqrt(np.trace(found.path_covariance_px2()) / 2))
+
+    whole = std_px(motion.start_s - 0.01, motion.end_s + 0.01)
+    assert whole == pytest.approx(lens.fx_px * 0.1 * motion.exposure_s, rel=0.02)
+    assert std_px(motion.end_s + 0.001, motion.end_s + 0.03) == 0.0
+    half = std_px(0.5 * (motion.start_s + motion.end_s), motion.end_s + 0.01)
+    assert half == pytest.approx(whole / np.sqrt(2), rel=0.05)
+
+
+def test_an_uncertain_rate_adds_to_what_neighbours_leave() -> None:
+    """Covariances add."""
+    motion = TurningCamera(phone()).motion
+    bridge = Field("rate", ("time",), ((motion.start_s - 1, motion.end_s + 1),), ((0.0,) * 3,) * 2, ((0.1,) * 3,) * 2)
+    bridged = replace(motion, profile=motion.profile.with_extensions(field=(bridge,)))
+    found = with_uncertain_rates(RefinedMotion(bridged, 0.02 * np.eye(3), 5.0), bridged)
+    assert found is not None
+    np.testing.assert_allclose(found.rate_covariance, 0.03 * np.eye(3), atol=1e-12)
+    assert found.scatter_px_s == 5.0
 
 
 @pytest.mark.parametrize("missing_rad_s", [0.0, 0.001, 0.003])
