@@ -32,7 +32,7 @@ from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.form_list import form_of_late_frames, forms_of_pairs
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import is_believable, with_fields
-from virest.diagnosis.field.stretches import KNOT_STEP_S, bridging_form, rate_walk
+from virest.diagnosis.field.stretches import KNOT_STEP_S, bridging_form
 from virest.diagnosis.field.sudden import best_instant, sudden_change
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
@@ -514,7 +514,7 @@ def test_a_wrong_offset_beside_a_gap_keeps_its_name_and_size() -> None:
 def test_a_bridge_that_does_not_explain_its_points_is_withheld_from_the_profile() -> None:
     """The fit uses it to join both sides of its interval, but restoration must not use it."""
     stretches = tuple(Stretch("straight", t, t + 0.1, (0, 1, 2)) for t in (0.5, 1.5))
-    good, bad = bridging_form(stretches, 0, np.ones(3)).fields
+    good, bad = bridging_form(stretches, 0, StrangePhone(HAND, Strange()).imu).fields
     entry = Distrusted(stretches, (good, bad), (True, False), 1e-9, 3.0, 0.2, 0.1)
     assert entry.withheld == (bad,)
     field = finding_of(entry, 0.05)
@@ -531,7 +531,7 @@ def test_the_knots_of_a_bridge_resolve_a_clipped_peak() -> None:
     clipped = replace(phone.imu, gyro_rad_s=np.clip(whole, -limit, limit))
     worst_rad = []
     for stretch in doubtful_stretches(clipped):
-        form = bridging_form([stretch], 0, np.ones(3))
+        form = bridging_form([stretch], 0, clipped)
         (axis,), knots = stretch.axes, form.fields[0].knots[0]
         inside = (time_s >= stretch.from_s) & (time_s <= stretch.to_s)
         if inside.sum() < 6:
@@ -544,19 +544,39 @@ def test_the_knots_of_a_bridge_resolve_a_clipped_peak() -> None:
     assert np.median(worst_rad) < 1.5e-4
 
 
-def test_a_bridge_without_points_is_straight_and_uncertain() -> None:
-    """Only its ends are known; the variation of hand motion gives the standard deviation."""
-    phone = StrangePhone(replace(HAND, seed=84), Strange())
-    stretch = Stretch("straight", 0.5, 0.7, (0, 2))
-    walk = rate_walk(phone.imu)
-    form = bridging_form([stretch], 0, walk)
-    count = form.basis.shape[1]
-    (bridge,) = form.filled(np.zeros(count), np.eye(count))
-    std = np.array(bridge.std)
-    assert not np.any(std[[0, -1]])
-    assert not np.any(std[:, 1])
-    middle = np.array(bridge.knots[0]) - 0.5
-    np.testing.assert_allclose(std[:, 0], walk[0] * np.sqrt(middle * (0.2 - middle) / 0.2), atol=1e-5)
+@pytest.mark.parametrize("kind", ["straight", "clipped"])
+def test_a_bridge_without_points_follows_the_readings_around_it(kind: str) -> None:
+    """The expected rate errs less than a straight line or the limit, and its deviation says by how much."""
+    errors, deviations, without = [], [], []
+    for seed in range(84, 96):
+        phone = StrangePhone(replace(HAND, seed=seed), Strange())
+        time_s, whole = phone.imu.time_s, phone.imu.gyro_rad_s
+        if kind == "clipped":
+            log = replace(phone.imu, gyro_rad_s=np.clip(whole, -1.2, 1.2))
+            stretches = doubtful_stretches(log)
+        else:
+            stretches = [Stretch("straight", t, t + 0.04, (0, 2)) for t in np.arange(0.3, 2.0, 0.2)]
+            log = replace(phone.imu, gyro_rad_s=whole)
+            for stretch in stretches:
+                log = replace(log, gyro_rad_s=filled(stretch.from_s, stretch.to_s)(time_s, log.gyro_rad_s, None))
+        form = bridging_form(stretches, 0, log)
+        uncertain = form.filled(np.zeros(form.basis.shape[1]), np.eye(form.basis.shape[1]))
+        for stretch, bridge, around in zip(stretches, form.fields, uncertain, strict=True):
+            values, std = np.array(bridge.values), np.array(around.std)
+            assert not np.any(values[[0, -1]])
+            assert not np.any(std[[0, -1]])
+            others = [axis for axis in range(3) if axis not in stretch.axes]
+            assert not np.any(values[:, others])
+            assert not np.any(std[:, others])
+            for axis in stretch.axes:
+                lacking = np.interp(bridge.knots[0], time_s, whole[:, axis] - log.gyro_rad_s[:, axis])[1:-1]
+                errors.append(values[1:-1, axis] - lacking)
+                deviations.append(std[1:-1, axis])
+                without.append(lacking)
+    error, std = np.concatenate(errors), np.concatenate(deviations)
+    assert len(error) > 100
+    assert np.sqrt(np.mean(error**2)) < 0.5 * np.sqrt(np.mean(np.concatenate(without) ** 2))
+    assert np.mean(np.abs(error) < 2 * std) > 0.9
 
 
 def test_two_unknown_effects_at_once_are_two_fields() -> None:

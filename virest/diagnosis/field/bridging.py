@@ -18,7 +18,7 @@ from virest.capture.records import Capture
 from virest.diagnosis.cross_validation import JUDGE_POINTS
 from virest.diagnosis.field.forms import FieldForm
 from virest.diagnosis.field.records import Distrusted
-from virest.diagnosis.field.stretches import bridging_form, rate_walk, touching
+from virest.diagnosis.field.stretches import bridging_form, touching
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, fit_model, make_evidence
 from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
 from virest.image_formation.point_model import TrackTable, integrate_motion
@@ -75,17 +75,22 @@ class Bridges:
     @staticmethod
     def over(doubtful: Doubtful, observed: ObservedTracks, capture: Capture, profile: CameraProfile) -> Bridges:
         """The bridges over some intervals; profile: its clocks are those of the intervals' pairs."""
-        form = bridging_form(doubtful.stretches, capture.stamp_0_ns, rate_walk(capture.imu))
+        form = bridging_form(doubtful.stretches, capture.stamp_0_ns, capture.imu)
         return Bridges(make_evidence(capture.imu, observed, profile), doubtful, form)
 
     def without(self, model: Model) -> Model:
         """The model without bridges."""
         return replace(model, profile=self.form.removed_from(model.profile))
 
+    def expected(self, model: Model) -> Model:
+        """The model with bridges as expected from the log alone."""
+        bare = self.without(model).profile
+        return replace(model, profile=bare.with_fields([*bare.fields, *self.form.fields]))
+
     def fitted(self, model: Model, table: TrackTable) -> TrackFit:
-        """Fit bridges, from 0, beside a model's terms and scene; without covariances."""
-        bare = self.without(model)
-        return fit_model(self.evidence.imu, bare, (*bare.terms, self.form.term), table, covariances=False)
+        """Fit bridges, from the expected ones, beside a model's terms and scene; without covariances."""
+        begun = self.expected(model)
+        return fit_model(self.evidence.imu, begun, (*begun.terms, self.form.term), table, covariances=False)
 
     def refitted(self, model: Model) -> Model:
         """The model with bridges fitted to all pairs beside its terms and scene."""
@@ -153,7 +158,8 @@ def with_bridges(found: GeometricVerdict, bridges: Bridges, capture: Capture) ->
         return
     trusted: Mask = np.asarray(~tested.near[~tested.holds].any(axis=0))
     kept = evidence.observed.chosen(trusted) if trusted.sum() >= LEAST_PAIRS_LEFT else evidence.observed
-    _refit(found, make_evidence(evidence.imu, kept, bare.profile), bare, (*terms, bridges.form.term))
+    begun = bridges.expected(bare)
+    _refit(found, make_evidence(evidence.imu, kept, bare.profile), begun, (*terms, bridges.form.term))
     profile, form = found.model.profile, bridges.form
     part_of = found.fit.slices[form.name]
     covariance = found.fit.covariance[part_of, part_of]

@@ -34,7 +34,7 @@ class FieldForm:
     """One or several fields that are fitted together."""
 
     fields: tuple[Field, ...]
-    """With value 0 everywhere."""
+    """With the values to which the numbers add: 0, or those that are expected before a fit."""
     basis: Array
     """(values of all fields, numbers): values at the knots per free number; columns are orthonormal."""
     step_s: float | None = None
