@@ -27,11 +27,15 @@ from virest.diagnosis.field.bridging import (
     pair_medians,
     with_bridges,
 )
-from virest.diagnosis.field.contradicted import climb_with_bridges, contradicted_stretches
+from virest.diagnosis.field.contradicted import (
+    climb_with_bridges,
+    contradicted_stretches,
+    with_fields_or_bridges,
+)
 from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.form_list import form_of_late_frames, forms_of_pairs
 from virest.diagnosis.field.records import Distrusted
-from virest.diagnosis.field.search import is_believable, with_fields
+from virest.diagnosis.field.search import is_believable
 from virest.diagnosis.field.stretches import KNOT_STEP_S, bridging_form
 from virest.diagnosis.field.sudden import best_instant, sudden_change
 from virest.diagnosis.field.words import finding_of
@@ -91,7 +95,7 @@ def judged(
         return climb(evidence, nominal, fitted, (), max_rungs=rungs, bridged=bridged)
 
     found = climb_with_bridges(phone.observed, capture, nominal, climbing)
-    found = with_fields(found, found.evidence, capture)
+    found = with_fields_or_bridges(found, capture, nominal)
     return found, [finding_of(entry, found.noise_px) for entry in found.fields]
 
 
@@ -283,6 +287,18 @@ def test_a_sudden_change_of_bias_is_a_step() -> None:
     assert (field.kind, field.covariates, field.shape) == ("rate", ("time",), "a step")
     assert field.fields[0].knots[0][0] == pytest.approx(1.13, abs=0.02)
     assert np.array(field.fields[0].values)[-1] == pytest.approx(-change, abs=0.002)
+    assert verdict.final_rms_px < 1.1 * HAND.noise_px
+
+
+def test_a_clock_that_is_set_delays_the_frames_after_it_and_leaves_the_log() -> None:
+    """A smooth curve would delay the frames beside the step by something in between; a bridge would bend the motion."""
+    late = Strange(late_in_frame_s=lambda fraction, stamp_s: np.where(stamp_s > 1.13, 0.006, 0.0))
+    phone = StrangePhone(HAND, late)
+    verdict, (field,) = judged(phone, phone.profile)
+    assert (field.kind, field.covariates) == ("delay", ("time",))
+    before_s, after_s = (phone.stamp_s[phone.stamp_s > 1.13][0] - 1 / 30, phone.stamp_s[phone.stamp_s > 1.13][0])
+    delays_s = field.fields[0].at_time(np.array([before_s, after_s]))[:, 0]
+    assert delays_s[1] - delays_s[0] == pytest.approx(0.006, abs=2e-4)
     assert verdict.final_rms_px < 1.1 * HAND.noise_px
 
 

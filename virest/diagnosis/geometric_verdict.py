@@ -49,6 +49,8 @@ class GeometricVerdict:
     """Typical standard deviation of a tracked step, per coordinate."""
     rival: GeometricVerdict | None = None
     """Another end of the ladder that held-out points cannot distinguish from this one; None: there is none."""
+    undoubted: GeometricVerdict | None = None
+    """The ladder's end before it bridged intervals that only the points contradict; None: it bridges none."""
     lag_std_s: float | None = None
     """Standard deviation of a start-up lag; None without one."""
     independent_share: float = 0.0

@@ -244,7 +244,8 @@ class DiagnosisSession:
         """The geometric verdict with the fields that its residuals require under this lighting."""
         own = self.geometric.model.profile
         same = self.geometric is self.first and with_flicker_of(own, lit) == own
-        if same and self._needs_fields_unlit is not None and not self._needs_fields_unlit():
+        searched = self._needs_fields_unlit if self.geometric.undoubted is None else None
+        if same and searched is not None and not searched():
             return self.geometric
         return self.points.described(self.geometric, lit)
 

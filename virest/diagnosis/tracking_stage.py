@@ -13,8 +13,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.candidates import FarStart
 from virest.diagnosis.field.bridging import doubtful_pairs
-from virest.diagnosis.field.contradicted import climb_with_bridges
-from virest.diagnosis.field.search import with_fields
+from virest.diagnosis.field.contradicted import climb_with_bridges, with_fields_or_bridges
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_ladder import climb
@@ -106,8 +105,8 @@ class TrackedPoints:
         """
         if not self.rungs_allowed or found.evidence is None:
             return found
-        model = replace(found.model, profile=with_flicker_of(found.model.profile, lit))
-        return with_fields(replace(found, model=model), found.evidence, self.capture)
+        undoubted = None if found.undoubted is None else _under(found.undoubted, lit)
+        return with_fields_or_bridges(replace(_under(found, lit), undoubted=undoubted), self.capture, self.start)
 
     def _climbed(self, observed: ObservedTracks, progress: Callable[[float], None]) -> GeometricVerdict:
         def climbing(evidence: Evidence, bridged: Callable[[Model], Model] | None) -> GeometricVerdict:
@@ -155,6 +154,10 @@ def at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]
 def lighting_changes(profile: CameraProfile) -> bool:
     """Whether the light changes between frames, which biases tracked points."""
     return bool(profile.extensions.flicker_amplitude or profile.extensions.gain)
+
+
+def _under(found: GeometricVerdict, lit: CameraProfile) -> GeometricVerdict:
+    return replace(found, model=replace(found.model, profile=with_flicker_of(found.model.profile, lit)))
 
 
 def with_flicker_of(profile: CameraProfile, lit: CameraProfile) -> CameraProfile:

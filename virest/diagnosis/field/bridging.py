@@ -263,15 +263,16 @@ def _refit(found: GeometricVerdict, evidence: Evidence, start: Model, terms: Seq
 
 def _holds(before: float, after: float, noise: float) -> bool:
     """Whether bridging leaves the points in an interval their noise, or removes most of their excess residual."""
-    return after < MAX_RMS_RATIO * noise or _removes_excess(before, after, noise)
+    return after < MAX_RMS_RATIO * noise or removes_excess(before, after, noise)
 
 
 def _convicted(before: float, after: float, usual: float) -> bool:
     """A log that is wrong leaves nothing but noise once the rate is free: anything more has another cause."""
-    return before > MAX_RMS_RATIO * usual > after and _removes_excess(before, after, usual)
+    return before > MAX_RMS_RATIO * usual > after and removes_excess(before, after, usual)
 
 
-def _removes_excess(before: float, after: float, noise: float) -> bool:
+def removes_excess(before: float, after: float, noise: float) -> bool:
+    """Whether less than MAX_EXCESS_LEFT of an excess squared residual over the noise remains."""
     return after**2 - noise**2 < MAX_EXCESS_LEFT * (before**2 - noise**2)
 
 

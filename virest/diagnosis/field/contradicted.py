@@ -22,8 +22,10 @@ from virest.diagnosis.field.bridging import (
     Doubtful,
     doubtful_pairs,
     pair_medians,
+    removes_excess,
     with_bridges,
 )
+from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.inference.chance import chi2_below, normal_deviate, normal_tail
@@ -55,7 +57,26 @@ def climb_with_bridges(
     if not further:
         return found
     stretches = tuple(sorted((*doubtful.stretches, *further), key=lambda stretch: stretch.from_s))
-    return _climbed(observed, capture, start, climb, Doubtful.over(stretches, observed, start))
+    bridged = _climbed(observed, capture, start, climb, Doubtful.over(stretches, observed, start))
+    bridged.undoubted = found
+    return bridged
+
+
+def with_fields_or_bridges(found: GeometricVerdict, capture: Capture, start: CameraProfile) -> GeometricVerdict:
+    """A verdict with the fields that its residuals support, without bridges that these make superfluous.
+
+    A clock that is set, or a lens that is switched, moves points within a few pairs more than in all others, as a log
+    does that is wrong for a moment.  The log is right if fields without bridges leave no interval that stands out, and
+    remove most of what fields beside bridges do.
+    """
+    assert found.evidence is not None
+    told, without = with_fields(found, found.evidence, capture), found.undoubted
+    if without is None or without.evidence is None:
+        return told
+    plain = with_fields(without, without.evidence, capture)
+    if not removes_excess(without.final_rms_px, plain.final_rms_px, told.final_rms_px):
+        return told
+    return told if contradicted_stretches(plain, capture, start) else plain
 
 
 def _climbed(

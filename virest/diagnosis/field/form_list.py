@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag, null_space
 
 from virest.arrays import Array
-from virest.camera.field import FORCES, KINDS, RATES, Field, cardinal_weights
+from virest.camera.field import FORCES, KINDS, RATES, TIMED_BY_IMU, Field, cardinal_weights
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.profile_source import focus_log
@@ -284,9 +284,15 @@ def _late_frames_form(starts_s: Array, stamp_0_ns: int, known: frozenset[str]) -
     )
 
 
-def step_forms(capture: Capture, at_s: Array, kind: str = "scale") -> list[FieldForm]:
-    """A sudden change of the focal length, or of the gyroscope's bias (kind ``rate``): one form per instant (n,)."""
-    edges = [np.array([t - STEP_EDGE_S / 2, t + STEP_EDGE_S / 2]) for t in at_s]
+def step_forms(
+    capture: Capture, at_s: Array, kind: str = "scale", profile: CameraProfile | None = None
+) -> list[FieldForm]:
+    """A sudden change of the focal length, of the gyroscope's bias (``rate``) or of the stamps (``delay``).
+
+    One form per instant (n,), IMU clock; profile: its clocks give a delay's instant on the camera's.
+    """
+    own_s = at_s if profile is None or kind in TIMED_BY_IMU else np.asarray(profile.camera_time_s(at_s))
+    edges = [np.array([t - STEP_EDGE_S / 2, t + STEP_EDGE_S / 2]) for t in own_s]
     fields = [_zero(kind, (TIME,), [edge], capture.stamp_0_ns) for edge in edges]
     later = np.kron(np.array([[0.0], [1.0]]), np.eye(KINDS[kind][1]))
     return [FieldForm((f,), later, float(t)) for f, t in zip(fields, at_s, strict=True)]

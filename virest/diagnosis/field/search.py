@@ -32,7 +32,7 @@ from virest.diagnosis.field.screening import (
     score_forms,
     select,
 )
-from virest.diagnosis.field.sudden import SuddenChange, best_instant, bias_step, lasting_change, sudden_change
+from virest.diagnosis.field.sudden import SuddenChange, best_instant, lasting_change, lasting_step, sudden_change
 from virest.diagnosis.geometric_effects import GeometricEffect, geometric_effect
 from virest.diagnosis.geometric_evidence import ITERATIONS, Evidence, Model, capped_rms, distances, fit_model, loss
 from virest.diagnosis.geometric_ladder import (
@@ -66,7 +66,7 @@ DEPTH = "scene_depth"
 """Translation in front of a near plane is confounded with gyroscope errors."""
 SCALE_OVER_TIME = f"scale{OVER}time"
 """Once a form of this family is in the model, no further sudden change is searched for."""
-RATE_OVER_TIME = f"rate{OVER}time"
+RATE_OVER_TIME, DELAY_OVER_TIME = f"rate{OVER}time", f"delay{OVER}time"
 """A bias that changes smoothly is tried beside one that changes at an instant."""
 MIN_DELAY_PART = 2 / 3
 """Least part of the excess residual that delays of single frames, or of a few, remove: of the gyroscope's noise, which
@@ -328,8 +328,8 @@ def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: Track
             scale = lasting_change(seen, tangent, search.effect(form))
             form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
         plain.append(_Proposal(form, selection, instead=instead))
-        if form.family == RATE_OVER_TIME:
-            stepped = bias_step(seen, tangent, capture, span_s, evidence.period_s)
+        if form.family in (RATE_OVER_TIME, DELAY_OVER_TIME):
+            stepped = lasting_step(seen, tangent, capture, span_s, evidence.period_s, form.kind)
             plain.append(_Proposal(stepped, selection, instead=instead))
     yield tuple(plain)
     forms = [form for form in (*forms, *pairs) if form.local or (form.is_pair and form.family not in in_model)]

@@ -23,8 +23,8 @@ KNOT_STEP_S = 0.015
 hand at 1 to 2 rad/s, the angle of a spline with this spacing errs by 0.1 mrad in the median and 0.3 mrad at most, about
 a tracker's noise; with twice the spacing by 0.3 and 1.4 mrad."""
 
-MOST_READINGS = 80
-"""Readings on which the rates in an interval are conditioned, at most about twice as many."""
+LEAST_READINGS, MOST_READINGS = 20, 80
+"""Trusted readings that tell noise and slope, else all do; most readings, about, on which rates are conditioned."""
 LEAST_NOISE_RAD_S = 1e-3
 """Least noise of a reading: 0.06°/s, a step of a 16-bit gyroscope."""
 
@@ -77,8 +77,9 @@ def _given_readings(imu: ImuSamples, axis: int, time_s: Array, untrusted: Sequen
     for stretch in untrusted:
         outside &= (imu.time_s <= stretch.from_s) | (imu.time_s >= stretch.to_s)
     known_s, known = imu.time_s[outside], rate[outside]
-    noise = max(float(np.mean(np.diff(known, 3) ** 2)) / 20, LEAST_NOISE_RAD_S**2)
-    slope = max(_slope_variance(known_s, known) - 2 * noise / KNOT_STEP_S**2, noise / KNOT_STEP_S**2)
+    usual_s, usual = (known_s, known) if len(known) >= LEAST_READINGS else (imu.time_s, rate)
+    noise = max(float(np.mean(np.diff(usual, 3) ** 2)) / 20, LEAST_NOISE_RAD_S**2)
+    slope = max(_slope_variance(usual_s, usual) - 2 * noise / KNOT_STEP_S**2, noise / KNOT_STEP_S**2)
     mean, variance = float(rate.mean()), max(float(rate.var()) - noise, noise)
     length_s = float(np.sqrt(5 / 3 * variance / slope))
     near = np.flatnonzero((known_s > time_s[0] - 2 * length_s) & (known_s < time_s[-1] + 2 * length_s))
@@ -96,13 +97,12 @@ def _given_readings(imu: ImuSamples, axis: int, time_s: Array, untrusted: Sequen
 
 
 def _slope_variance(time_s: Array, rate: Array) -> float:
-    """Mean square slope, (rad/s²)², of a rate (n,) over KNOT_STEP_S between readings no further apart."""
+    """Mean square slope, (rad/s²)², of a rate (n,) between readings about KNOT_STEP_S apart."""
     later = np.searchsorted(time_s, time_s + KNOT_STEP_S)
     first = np.flatnonzero(later < len(time_s))
     step_s = time_s[later[first]] - time_s[first]
-    first, step_s = first[step_s < 2 * KNOT_STEP_S], step_s[step_s < 2 * KNOT_STEP_S]
-    slopes = (rate[later[first]] - rate[first]) / step_s
-    return max(float(np.mean(slopes**2)), 1e-6) if len(first) else 1.0
+    near = step_s <= max(2 * KNOT_STEP_S, float(step_s.min()))
+    return float(np.mean(((rate[later[first]] - rate[first])[near] / step_s[near]) ** 2))
 
 
 def axis_names(stretches: Iterable[Stretch]) -> str:

@@ -1,4 +1,4 @@
-"""Sudden changes of the focal length (a phone that switches its lens) and of the gyroscope's bias.
+"""Sudden changes of the focal length (a phone that switches its lens), of the gyroscope's bias, and of the clocks.
 
 Between the two frames around the change, the scale changes by many times the tracking noise, more than between any
 other pair; a robust fit rejects these points as outliers.  Later frames show whether the change lasts.
@@ -27,9 +27,9 @@ LEAST_POINTS, LEAST_PAIRS = 8, 15
 INSTANTS, REACH = 97, FRAMES_PER_STEP + 1.0
 """Number of instants tried, and the search range in frames before and after: the coarse search ignores FRAMES_PER_STEP
 frames around a change, and its instants are off by up to half of that."""
-BIAS_INSTANTS = 2 * 4 * FRAMES_PER_STEP + 1
-"""Instants of a bias' change within FRAMES_PER_STEP frames of the coarse one, 8 ms apart at 30 frames/s: the error in
-between, at 0.05 rad/s and 600 px, is 0.1 px in one pair of frames."""
+LASTING_INSTANTS = 2 * 4 * FRAMES_PER_STEP + 1
+"""Instants of a lasting change within FRAMES_PER_STEP frames of the coarse one, 8 ms apart at 30 frames/s: the error in
+between, of a bias that changes by 0.05 rad/s at 600 px, is 0.1 px in one pair of frames."""
 MAD_EFFICIENCY = 0.37
 """A standard deviation from the median of magnitudes is as accurate as the usual one from this part of the values
 (Rousseeuw & Croux 1993, doi:10.1080/01621459.1993.10476408)."""
@@ -142,13 +142,18 @@ def best_instant(seen: PointResiduals, capture: Capture, at_s: float, scale: flo
     return forms[int(equally_good[len(equally_good) // 2])]
 
 
-def bias_step(
-    seen: PointResiduals, tangent: Array, capture: Capture, span_s: tuple[float, float], period_s: float
+def lasting_step(
+    seen: PointResiduals,
+    tangent: Array,
+    capture: Capture,
+    span_s: tuple[float, float],
+    period_s: float,
+    kind: str,
 ) -> FieldForm:
-    """The form of a sudden change of the bias at the instant that explains most beside the tangent space (n, 2, m).
+    """The form of a sudden change of a kind at the instant that explains most beside the tangent space (n, 2, m).
 
-    A bias that a phone corrects while it logs changes between two readings, which a curve through knots follows only
-    with overshoots.
+    A bias that a phone corrects while it logs, or a clock that it sets, changes between two readings, which a curve
+    through knots follows only with overshoots.
     """
     root = np.repeat(np.sqrt(seen.weight), 2)[:, None]
     frame = np.linalg.qr(tangent.reshape(len(root), -1) * root)[0]
@@ -160,8 +165,9 @@ def bias_step(
         own = own - frame @ (frame.T @ own)
         return float(np.sum((np.linalg.qr(own)[0].T @ error) ** 2))
 
-    coarse = step_forms(capture, candidate_steps_s(span_s, capture), "rate")
-    near_s = max(coarse, key=explained).step_s
+    def forms(at_s: Array) -> list[FieldForm]:
+        return step_forms(capture, at_s, kind, seen.fit.profile)
+
+    near_s = max(forms(candidate_steps_s(span_s, capture)), key=explained).step_s
     assert near_s is not None
-    fine = np.linspace(-1, 1, BIAS_INSTANTS) * FRAMES_PER_STEP * period_s
-    return max(step_forms(capture, near_s + fine, "rate"), key=explained)
+    return max(forms(near_s + np.linspace(-1, 1, LASTING_INSTANTS) * FRAMES_PER_STEP * period_s), key=explained)
