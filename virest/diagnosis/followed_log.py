@@ -45,6 +45,8 @@ KNOTS = 5
 """Most knots of a curve over a logged quantity: a cubic spline through 5 follows one period to 10 % (rms)."""
 TABLE = "exposure_rows"
 """Kind of the finding for an exposure table that is some rows off; ``extensions.exposures_late_frames`` holds it."""
+LEAST_FRAMES = 3
+"""Least frames whose delays are compared with exposures: an offset and a factor are fitted to them."""
 FROM_ONE = 0.25
 """Largest difference from 1 of the factor by which gains follow another frame's exposure × ISO: half way to the factor
 of an encoder that is late by half a frame (DELAY_FRAMES)."""
@@ -100,6 +102,8 @@ def rows_late(finding: FieldFinding, frames: Sequence[Frame], profile: CameraPro
     exposure_s = np.array([frame.exposure_s or np.nan for frame in frames])
     start_s = np.array([clock.start_on_camera_s(frame.time_s, frame.exposure_s or 0.0) for frame in frames])
     seen = (start_s >= late.knots[0][0]) & (start_s <= late.knots[0][-1])
+    if seen.sum() < LEAST_FRAMES:  # a step has its two knots between two frames
+        return 0
     found_s = late.at_time(start_s[seen])[:, 0]
     for rows in ROWS_LATE:
         moved = np.clip(np.arange(len(frames)) + rows, 0, len(frames) - 1)

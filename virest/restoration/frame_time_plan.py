@@ -33,6 +33,8 @@ ROWS_LATE = (1, -1, 2, -2)
 """Rows by which a table of exposures may lag (+) or lead (−) the movie."""
 MOST_FRAMES = 3000
 """Frames of a movie that are tracked for delays of their own, the first ones: 3000 of 640×480 take 20 s."""
+SAME_START_S, LEAST_OWN = 1e-4, 0.5
+"""Distance at which a knot is that of a frame; least part of frames and knots that are, for delays of single frames."""
 SOURCE = "tracked points against the gyroscope, frame by frame"
 
 
@@ -84,8 +86,10 @@ def find_frame_times(
     when each frame was taken.
     """
     profile = plan.profile
-    if profile.intrinsics is None or profile.time_offset_s is None or has_frame_delays(profile):
+    if profile.intrinsics is None or profile.time_offset_s is None:
         return None
+    if has_frame_delays(profile):
+        return _with_further_delays(plan, given, capture, track_all)
     observed = observe_tracks(capture, pairs, profile)
     turns = _turns(observed, capture.imu, profile)
     found = None if turns is None else fit_frame_delays(turns)
@@ -116,7 +120,52 @@ def find_frame_times(
 
 def has_frame_delays(profile: CameraProfile) -> bool:
     """Whether the profile delays whole frames already."""
-    return any((field.kind, field.covariates) == ("delay", ("time",)) for field in profile.extensions.field)
+    return any(map(_delays_frames, profile.extensions.field))
+
+
+def _delays_frames(field: Field) -> bool:
+    return (field.kind, field.covariates) == ("delay", ("time",))
+
+
+def _with_further_delays(
+    plan: RestorationPlan,
+    given: CameraProfile,
+    capture: Capture,
+    track_all: Callable[[Sequence[int]], Sequence[TrackPair]],
+) -> FrameTimes | None:
+    """Delays of frames that given delays of single frames leave out, such as those that a fit kept back.
+
+    They are those that points show against the given ones of the other frames, but for an offset and a skew, which each
+    fit takes out for itself.  None if the given delay is a curve over time, or if no frame is left out.
+    """
+    usable = [frame for frame in capture.frames if frame.skip_reason is None][:MOST_FRAMES]
+    others = [one for one in given.fields if not _delays_frames(one)]
+    field = next(filter(_delays_frames, given.extensions.field))
+    starts_s = _starts_s(plan.profile, usable)
+    own = np.abs(starts_s[:, None] - field.knots[0]).min(axis=1) < SAME_START_S
+    if own.all() or own.sum() < LEAST_OWN * max(len(usable), len(field.knots[0])):
+        return None
+    numbers = [frame.index for frame in usable]
+    stripped = plan.profile.with_fields([one for one in plan.profile.fields if not _delays_frames(one)])
+    turns = _turns(observe_tracks(capture, track_all(numbers), stripped), capture.imu, stripped)
+    found = None if turns is None else fit_frame_delays(turns)
+    if found is None:
+        return None
+    shown = np.isin(numbers, found.frame)
+    place = np.searchsorted(found.frame, np.array(numbers)[shown])
+    late_s, std_s = np.zeros(len(usable)), np.full(len(usable), found.jitter_s)
+    late_s[shown], std_s[shown] = found.late_s[place], found.std_s[place]
+    both = own & shown
+    if both.sum() <= 2:
+        return None
+    apart = np.polynomial.Polynomial.fit(starts_s[both], field.at_time(starts_s[both])[:, 0] - late_s[both], 1)
+    late_s[shown] += apart(starts_s[shown])
+    late_s[own] = field.at_time(starts_s[own])[:, 0]
+    if field.std:
+        std_s[own] = field.std_over_time(starts_s[own])[:, 0]
+    completed = given.with_fields([*others, _delay_field(starts_s, late_s, std_s, capture)])
+    text = f"{(~own).sum()} frames that the profile gives no delay of their own get the one that points show"
+    return FrameTimes(capture, completed, 0, text)
 
 
 def rows_apart(rows_late: int) -> str:
@@ -155,13 +204,22 @@ def _with_delays(
     given: CameraProfile, profile: CameraProfile, capture: Capture, usable: Sequence[Frame], found: FrameDelays
 ) -> CameraProfile:
     """The given profile with a delay for each usable frame, none for those whose points do not show it."""
-    clock = RowClock(profile)
     late = dict(zip(found.frame.tolist(), zip(found.late_s, found.std_s, strict=True), strict=True))
-    starts = {float(clock.start_on_camera_s(f.time_s, f.exposure_s or 0.0)): f.index for f in usable}
-    knots = sorted(starts)
-    values = np.array([late.get(starts[knot], (0.0, found.jitter_s)) for knot in knots])
-    field = Field("delay", ("time",), (tuple(knots),), _column(values[:, 0]), _column(values[:, 1]), capture.stamp_0_ns)
-    return given.with_fields([*given.fields, field])
+    late_s, std_s = np.transpose([late.get(frame.index, (0.0, found.jitter_s)) for frame in usable])
+    return given.with_fields([*given.fields, _delay_field(_starts_s(profile, usable), late_s, std_s, capture)])
+
+
+def _starts_s(profile: CameraProfile, frames: Sequence[Frame]) -> Array:
+    """Starts of the first rows of frames, camera clock."""
+    clock = RowClock(profile)
+    return np.array([float(clock.start_on_camera_s(f.time_s, f.exposure_s or 0.0)) for f in frames])
+
+
+def _delay_field(starts_s: Array, late_s: Array, std_s: Array, capture: Capture) -> Field:
+    """A delay of each frame, by the starts of their first rows; one of frames with the same start counts."""
+    knots, last = np.unique(starts_s[::-1], return_index=True)
+    rows = [_column(values[::-1][last]) for values in (late_s, std_s)]
+    return Field("delay", ("time",), (tuple(knots.tolist()),), rows[0], rows[1], capture.stamp_0_ns)
 
 
 def _column(values: Array) -> tuple[tuple[float, ...], ...]:
