@@ -99,14 +99,32 @@ def test_exposures_in_other_rows_are_given_back_to_their_frames(capture: Capture
     assert np.abs(off_s).max() < 4e-4
 
 
-def test_a_profile_that_delays_frames_already_is_taken_as_it_is(capture: Capture) -> None:
-    """The field that a diagnosis or an earlier plan has found is not searched for again."""
+def test_delays_of_single_frames_are_taken_as_they_are_and_completed(capture: Capture) -> None:
+    """A diagnosis keeps frames back; a spline through the other frames' jitter says nothing about theirs."""
     jitter_s = np.random.default_rng(4).normal(0, 0.004, FRAMES)
     moved = tuple(replace(f, time_s=f.time_s + float(jitter_s[f.index])) for f in capture.frames)
     shaken = replace(capture, frames=moved)
     found = planned(shaken)
-    given = resolve_profile(capture)[0].with_fields(found.profile.fields)
-    assert not said(planned(shaken, given))
+    (field,) = found.profile.fields
+    whole = resolve_profile(capture)[0].with_fields([field])
+    assert not said(planned(shaken, whole))
+    left_out = np.array([6, 7, 20, 33])
+    kept = np.setdiff1d(np.arange(FRAMES), left_out)
+    knots, values, std = (np.array(part) for part in (field.knots[0], field.values, field.std))
+    assert len(knots) == FRAMES
+    rows = [tuple(map(tuple, part[kept].tolist())) for part in (values + 0.0005, std)]
+    less = replace(field, knots=(tuple(knots[kept].tolist()),), values=rows[0], std=rows[1])
+    plan = planned(shaken, whole.with_fields([less]))
+    (text,) = said(plan)
+    assert text.startswith("4 frames that the profile gives no delay")
+    (completed,) = plan.profile.fields
+    off_s = completed.at_time(knots)[:, 0] - field.at_time(knots)[:, 0] - 0.0005
+    assert np.abs(off_s[kept]).max() < 1e-5
+    assert np.abs(off_s[left_out]).max() < 3e-4
+    spline_s = less.at_time(knots[left_out])[:, 0] - field.at_time(knots[left_out])[:, 0]
+    assert np.abs(spline_s).max() > 2e-3
+    curve = replace(less, knots=(tuple(knots[::4].tolist()),), values=rows[0][:10], std=rows[1][:10])
+    assert not said(planned(shaken, whole.with_fields([curve])))
 
 
 def test_simulate_logs_exposures_as_late_as_the_profile_says(tmp_path: Path) -> None:

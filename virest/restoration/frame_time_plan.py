@@ -50,13 +50,15 @@ class FrameTimes:
     """Rows by which exposures are logged late."""
     text: str
     """Message about it."""
+    most_left: float | None = MOST_LEFT
+    """Largest fraction of the contradiction that may remain; None: any, since times of a few frames hardly change it."""
 
     def explain(self, before: RestorationPlan, after: RestorationPlan) -> bool:
         """Whether most of what contradicts the points is gone with these times, and no frame is lost."""
         if after.refusal is not None and before.refusal is None:
             return False
         left, rest = (plan.points_off_rad_s or 0.0 for plan in (before, after))
-        return rest**2 <= MOST_LEFT * left**2
+        return self.most_left is None or rest**2 <= self.most_left * left**2
 
     def noted(self, plan: RestorationPlan) -> RestorationPlan:
         """The plan that was made with these times, for the capture as it was read."""
@@ -165,7 +167,7 @@ def _with_further_delays(
         std_s[own] = field.std_over_time(starts_s[own])[:, 0]
     completed = given.with_fields([*others, _delay_field(starts_s, late_s, std_s, capture)])
     text = f"{(~own).sum()} frames that the profile gives no delay of their own get the one that points show"
-    return FrameTimes(capture, completed, 0, text)
+    return FrameTimes(capture, completed, 0, text, most_left=None)
 
 
 def rows_apart(rows_late: int) -> str:
