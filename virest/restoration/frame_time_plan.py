@@ -51,7 +51,7 @@ class FrameTimes:
     text: str
     """Message about it."""
     most_left: float | None = MOST_LEFT
-    """Largest fraction of the contradiction that may remain; None: any, since times of a few frames hardly change it."""
+    """Largest part of the contradiction that may remain; None: any, since times of a few frames hardly change it."""
 
     def explain(self, before: RestorationPlan, after: RestorationPlan) -> bool:
         """Whether most of what contradicts the points is gone with these times, and no frame is lost."""
