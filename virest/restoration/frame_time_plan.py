@@ -142,10 +142,11 @@ def _with_further_delays(
     """
     usable = [frame for frame in capture.frames if frame.skip_reason is None][:MOST_FRAMES]
     others = [one for one in given.fields if not _delays_frames(one)]
-    field = next(filter(_delays_frames, given.extensions.field))
-    starts_s = _starts_s(plan.profile, usable)
-    own = np.abs(starts_s[:, None] - field.knots[0]).min(axis=1) < SAME_START_S
-    if own.all() or own.sum() < LEAST_OWN * max(len(usable), len(field.knots[0])):
+    field, *more = filter(_delays_frames, given.extensions.field)
+    starts_s, knots_s = _starts_s(plan.profile, usable), np.array(field.knots[0])
+    after = np.searchsorted(knots_s, starts_s).clip(1, len(knots_s) - 1)
+    own = np.minimum(np.abs(starts_s - knots_s[after - 1]), np.abs(starts_s - knots_s[after])) < SAME_START_S
+    if more or own.all() or own.sum() < LEAST_OWN * max(len(usable), len(knots_s)):
         return None
     numbers = [frame.index for frame in usable]
     stripped = plan.profile.with_fields([one for one in plan.profile.fields if not _delays_frames(one)])

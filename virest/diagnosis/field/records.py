@@ -48,7 +48,7 @@ class Distrusted:
     usable: tuple[bool, ...]
     """Whether these rates explain the points."""
     p_value: float | None
-    """For the hypothesis that residuals there are no larger than elsewhere; None: all pairs are affected."""
+    """For the hypothesis that residuals there are no larger than elsewhere; None: no points tell."""
     before_px: float
     """Residual rms of the points of affected pairs."""
     after_px: float
