@@ -201,7 +201,7 @@ def restore_frames(
             compared,
             unmasked,
             here.coding_step,
-            plan.undetected_rad_s,
+            plan.undetected_rad_s if plan.missing_turn is None else None,
             predicted_from(before, here),
         )
 

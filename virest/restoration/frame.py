@@ -143,11 +143,10 @@ def restore_frame(
     if method != "none":
         covariance_px2 = np.zeros((2, 2)) if refined is None else refined.path_covariance_px2()
         position_std_px = refined.position_std_px() if refined is not None and straighten else 0.0
-        path_std_px = None
-        if refined is not None:
-            path_std_px = float(np.sqrt(np.trace(covariance_px2) / 2))
-        elif undetected_rad_s is not None:
-            path_std_px = unrefined_path_std_px(motion, undetected_rad_s)
+        stds_px = [] if refined is None else [float(np.sqrt(np.trace(covariance_px2) / 2))]
+        if undetected_rad_s is not None:
+            stds_px.append(unrefined_path_std_px(motion, undetected_rad_s))
+        path_std_px = float(np.linalg.norm(stds_px)) if stds_px else None
         blur = _KnownBlur(
             motion, anchor, longest_px, covariance_px2, path_std_px, position_std_px, light, coding_step, unrefined,
             predicted,
