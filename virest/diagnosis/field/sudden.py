@@ -168,6 +168,9 @@ def lasting_step(
     def forms(at_s: Array) -> list[FieldForm]:
         return step_forms(capture, at_s, kind, seen.fit.profile)
 
+    if kind == "delay":  # the pair of frames around it moves most, so that no other instant is near the best
+        seen_s = np.unique(np.concatenate([seen.table.first_stamp_s, seen.table.second_stamp_s]))
+        return max(forms(np.asarray(seen.fit.profile.imu_time_s((seen_s[1:] + seen_s[:-1]) / 2))), key=explained)
     near_s = max(forms(candidate_steps_s(span_s, capture)), key=explained).step_s
     assert near_s is not None
     return max(forms(near_s + np.linspace(-1, 1, LASTING_INSTANTS) * FRAMES_PER_STEP * period_s), key=explained)
