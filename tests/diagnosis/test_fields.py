@@ -296,6 +296,8 @@ def test_a_clock_that_is_set_delays_the_frames_after_it_and_leaves_the_log() -> 
     phone = StrangePhone(HAND, late)
     verdict, (field,) = judged(phone, phone.profile)
     assert (field.kind, field.covariates, field.shape) == ("delay", ("time",), "a step")
+    assert "frames from 1.1" in field.sentence
+    assert "late by 6" in field.sentence or "late by 5.9" in field.sentence
     before_s, after_s = (phone.stamp_s[phone.stamp_s > 1.13][0] - 1 / 30, phone.stamp_s[phone.stamp_s > 1.13][0])
     delays_s = field.fields[0].at_time(np.array([before_s, after_s]))[:, 0]
     assert delays_s[1] - delays_s[0] == pytest.approx(0.006, abs=1e-4)

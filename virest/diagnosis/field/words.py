@@ -58,6 +58,11 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "stamps that are taken in software, a queue that fills, or a clock that is corrected while it runs",
         "film a display that counts milliseconds, and compare the steps of the stamps with the steps shown",
     ),
+    ("delay", ("step",)): Pattern(
+        "frames from {at} s on are {lateness} by {size}: the stamps' clock was set",
+        "a clock that is corrected while it runs, or a queue that lost a frame",
+        "film a display that counts milliseconds, and compare the steps of the stamps with the steps shown",
+    ),
     ("delay", ("frame",)): Pattern(
         "the frames' stamps jitter: from frame to frame they are off by {size} (rms)",
         "stamps that are taken in software when a frame arrives, not by the sensor, or that were rounded or averaged",
@@ -138,6 +143,8 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     if form.by_frame and is_jitter(late_s := np.array(fields[0].values)[:, 0]):
         shape, pattern = JITTER, PATTERNS[form.kind, ("frame",)]
         size, std = _rms_of(late_s, np.array(fields[0].std)[:, 0])
+    if form.kind == "delay" and form.step_s is not None:
+        pattern = PATTERNS[form.kind, ("step",)]
     factor, unit = UNIT_SCALES[form.kind]
     amount = f"{size * factor:.3g} {unit}"
     sentence = pattern.sentence.format(
@@ -147,6 +154,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
         lateness=_lateness(fields[0]),
         lens=lens_words(shape),
         rates=_at_rates(fields[0]),
+        at=f"{fields[0].knots[0][0]:.2f}",
     )
     rms = f" (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out)"
     beside = f"; in this capture {' and '.join(entry.rivals)} would explain it equally well" if entry.rivals else ""
