@@ -142,11 +142,9 @@ def test_a_log_that_looks_clipped_is_named_before_processing(swing: Path, virest
         row[1] = f"{min(max(float(row[1]), -limit), limit):.7g}"
     log.write_text("\n".join([head, *map(",".join, cells)]) + "\n", encoding="utf-8")
     said = f"the gyroscope log looks clipped at {limit:.3g} rad/s"
-    notes = json.loads(virest_here("inspect", folder, "--json").stdout)["notes"]
+    notes, sound = (json.loads(virest_here("inspect", one, "--json").stdout)["notes"] for one in (folder, swing))
     assert [note["severity"] for note in notes if note["text"].startswith(said)] == ["warning"]
-    assert not any(
-        "looks" in note["text"] for note in json.loads(virest_here("inspect", swing, "--json").stdout)["notes"]
-    )
+    assert not any("looks" in note["text"] for note in sound)
     planned = virest_here("process", folder, "--dry-run", "--preset", "fast")
     assert said in planned.stderr
     assert "virest diagnose" in planned.stderr

@@ -36,7 +36,7 @@ LAST_SEGMENT_S = 120.0
 """How long to wait at exit for segments in progress."""
 VERBOSE_LOGGERS = ("distributed", "tornado", "asyncio")
 """Loggers that report a lost connection in many lines."""
-LIBRARIES = ("numpy", "opencv-python-headless", "av", "isal")
+LIBRARIES = ("numpy", "opencv-python-headless", "av", "deflate")
 """Libraries that determine the bytes of a picture."""
 TRANSFORMS = "transforms by"
 """The library of tiles' Fourier transforms, which follows from OpenCV's build and the environment."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from virest.image_formation.transforms import Transform
 
 Json = dict[str, Any]
-NEEDED = ("numpy", "scipy", "opencv-python-headless", "av", "isal", "pandas", "pydantic", "PyYAML", "typer", "tqdm",
+NEEDED = ("numpy", "scipy", "opencv-python-headless", "av", "deflate", "pandas", "pydantic", "PyYAML", "typer", "tqdm",
           "matplotlib", "jinja2")  # fmt: skip
 EXTRAS = {
     "cluster": ("distributed", "fsspec", "s3fs"),

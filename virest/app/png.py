@@ -1,20 +1,21 @@
-"""Lossless PNG encoding (ISO/IEC 15948): "up" filter, deflated by ISA-L.
+"""Lossless PNG encoding (ISO/IEC 15948): "up" filter, deflated by libdeflate.
 
-Every restored frame is written, so encoding time matters: ISA-L's deflate takes 1/4 of zlib's time for files of the
-same size.
+Every restored frame is written, so encoding time matters: libdeflate takes a third of zlib's time for files of the same
+size.  The same picture gives the same bytes in every process; with ISA-L, faster still, a run in hundreds wrote the same
+pixels in other bytes.
 """
 
 from __future__ import annotations
 
 import struct
 
+import deflate
 import numpy as np
-from isal import igzip_lib, isal_zlib
 from numpy.typing import NDArray
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEVEL = 1
-"""Of ISA-L's four levels; level 0 gives files 1/6 larger in hardly less time."""
+"""Of libdeflate's twelve, the fastest that compresses."""
 _FILTER_UP = 2
 """PNG's filter that subtracts the row above (PNG specification, 9.2)."""
 _COLOUR_TYPES = {1: 0, 3: 2}
@@ -32,7 +33,7 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
     height, width = picture.shape[:2]
     header = struct.pack(">IIBBBBB", width, height, 8, _COLOUR_TYPES[channels], 0, 0, 0)
     rows = less_row_above(picture.reshape(height, width * channels))
-    data = igzip_lib.compress(rows, LEVEL, flag=igzip_lib.COMP_ZLIB)
+    data = deflate.zlib_compress(rows, LEVEL)
     return b"".join((SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")))
 
 
@@ -53,7 +54,7 @@ def _channels(picture: NDArray[np.uint8]) -> int:
     return channels
 
 
-def _chunk(kind: bytes, data: bytes) -> tuple[bytes, ...]:
+def _chunk(kind: bytes, data: bytes | bytearray) -> tuple[bytes | bytearray, ...]:
     """The parts of a chunk: length, type, data, checksum."""
-    checksum = isal_zlib.crc32(data, isal_zlib.crc32(kind))
+    checksum = deflate.crc32(data, deflate.crc32(kind))
     return struct.pack(">I", len(data)), kind, data, struct.pack(">I", checksum)
