@@ -1,8 +1,8 @@
 """Lossless PNG encoding (ISO/IEC 15948): "up" filter, deflated by libdeflate.
 
 Every restored frame is written, so encoding time matters: libdeflate takes a third of zlib's time for files of the same
-size.  The same picture gives the same bytes in every process; with ISA-L, faster still, a run in hundreds wrote the same
-pixels in other bytes.
+size.  The same picture gives the same bytes in every process; with ISA-L, which is faster, a run in hundreds wrote the
+same pixels in other bytes.
 """
 
 from __future__ import annotations

@@ -137,13 +137,12 @@ class CameraProfile:
 
     def bridges(self, from_s: float, to_s: float) -> bool:
         """Whether a field of the rate over time bridges exactly this stretch of the inertial log."""
-        knots = (field.knots[0] for field in self.rates_over_time)
+        knots = (field.knots[0] for field in self.over_time("rate"))
         return any(max(abs(k[0] - from_s), abs(k[-1] - to_s)) < BRIDGE_SLACK_S for k in knots)
 
-    @property
-    def rates_over_time(self) -> tuple[ModelField, ...]:
-        """Fields of the rate over time: bridges of untrusted stretches, and biases that drift."""
-        return tuple(f for f in self.extensions.field if f.kind == "rate" and f.covariates == ("time",))
+    def over_time(self, kind: str) -> tuple[ModelField, ...]:
+        """Fields of a kind over time alone: ``delay`` of whole frames; ``rate``, a bridge or a bias that drifts."""
+        return tuple(f for f in self.extensions.field if (f.kind, f.covariates) == (kind, ("time",)))
 
     def with_fields(self, fields: Sequence[ModelField]) -> CameraProfile:
         """The profile with exactly these fields. Raises SettingsError for two fields of a kind that must be unique."""
@@ -201,17 +200,12 @@ class CameraProfile:
     def camera_time_s(self, imu_time_s: Any) -> Any:
         """Camera clock of an IMU time: the inverse of :meth:`imu_time_s`."""
         found = even_s = (imu_time_s - (self.time_offset_s or 0.0)) / (1.0 + self.clock_skew)
-        for _ in range(3 if self._wanders else 0):
+        for _ in range(3 if self.over_time("delay") else 0):
             found = even_s - self._late_s(found) / (1.0 + self.clock_skew)
         return found
 
-    @property
-    def _wanders(self) -> list[ModelField]:
-        """Fields of delay over time alone, which apply to whole frames."""
-        return [f for f in self.extensions.field if (f.kind, f.covariates) == ("delay", ("time",))]
-
     def _late_s(self, camera_time_s: Any) -> Any:
-        late = [f.at_time(camera_time_s)[..., 0] for f in self._wanders]
+        late = [f.at_time(camera_time_s)[..., 0] for f in self.over_time("delay")]
         return sum(late) if late else 0.0
 
     def with_estimate(self, name: str, value: Any, std: Any, source: str, **changes: Any) -> CameraProfile:

@@ -90,7 +90,7 @@ def find_frame_times(
     profile = plan.profile
     if profile.intrinsics is None or profile.time_offset_s is None:
         return None
-    if has_frame_delays(profile):
+    if profile.over_time("delay"):
         return _with_further_delays(plan, given, capture, track_all)
     observed = observe_tracks(capture, pairs, profile)
     turns = _turns(observed, capture.imu, profile)
@@ -120,15 +120,6 @@ def find_frame_times(
     return FrameTimes(capture, _with_delays(given, profile, capture, usable[: MOST_FRAMES + 1], found), 0, text)
 
 
-def has_frame_delays(profile: CameraProfile) -> bool:
-    """Whether the profile delays whole frames already."""
-    return any(map(_delays_frames, profile.extensions.field))
-
-
-def _delays_frames(field: Field) -> bool:
-    return (field.kind, field.covariates) == ("delay", ("time",))
-
-
 def _with_further_delays(
     plan: RestorationPlan,
     given: CameraProfile,
@@ -141,15 +132,15 @@ def _with_further_delays(
     fit takes out for itself.  None if the given delay is a curve over time, or if no frame is left out.
     """
     usable = [frame for frame in capture.frames if frame.skip_reason is None][:MOST_FRAMES]
-    others = [one for one in given.fields if not _delays_frames(one)]
-    field, *more = filter(_delays_frames, given.extensions.field)
+    field, *more = given.over_time("delay")
     starts_s, knots_s = _starts_s(plan.profile, usable), np.array(field.knots[0])
     after = np.searchsorted(knots_s, starts_s).clip(1, len(knots_s) - 1)
     own = np.minimum(np.abs(starts_s - knots_s[after - 1]), np.abs(starts_s - knots_s[after])) < SAME_START_S
     if more or own.all() or own.sum() < LEAST_OWN * max(len(usable), len(knots_s)):
         return None
     numbers = [frame.index for frame in usable]
-    stripped = plan.profile.with_fields([one for one in plan.profile.fields if not _delays_frames(one)])
+    delays = plan.profile.over_time("delay")
+    stripped = plan.profile.with_fields([one for one in plan.profile.fields if one not in delays])
     turns = _turns(observe_tracks(capture, track_all(numbers), stripped), capture.imu, stripped)
     found = None if turns is None else fit_frame_delays(turns)
     if found is None:
@@ -166,6 +157,7 @@ def _with_further_delays(
     late_s[own] = field.at_time(starts_s[own])[:, 0]
     if field.std:
         std_s[own] = field.std_over_time(starts_s[own])[:, 0]
+    others = [one for one in given.fields if one != field]
     completed = given.with_fields([*others, _delay_field(starts_s, late_s, std_s, capture)])
     text = f"{(~own).sum()} frames that the profile gives no delay of their own get the one that points show"
     return FrameTimes(capture, completed, 0, text, most_left=None)

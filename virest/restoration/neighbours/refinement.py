@@ -172,7 +172,7 @@ def with_uncertain_rates(refined: RefinedMotion | None, motion: RowMotion) -> Re
     taken to last for the exposure, since a bridge's knots are about as far apart.
     """
     profile, time_s, variance = motion.profile, np.linspace(motion.start_s, motion.end_s, RATE_STEPS), np.zeros(3)
-    for field in profile.rates_over_time:
+    for field in profile.over_time("rate"):
         if field.std and field.knots[0][0] < motion.end_s and field.knots[0][-1] > motion.start_s:
             variance += np.mean(field.std_over_time(time_s) ** 2, axis=0)
     if not variance.any():
