@@ -564,13 +564,13 @@ def test_the_knots_of_a_bridge_resolve_a_clipped_peak() -> None:
 
 @pytest.mark.parametrize("kind", ["straight", "clipped"])
 def test_a_bridge_without_points_follows_the_readings_around_it(kind: str) -> None:
-    """The expected rate errs less than a straight line or the limit, and its deviation says by how much."""
+    """The expected rate errs a fifth as much as a straight line or the limit; its deviation says by how much."""
     errors, deviations, without = [], [], []
     for seed in range(84, 96):
         phone = StrangePhone(replace(HAND, seed=seed), Strange())
         time_s, whole = phone.imu.time_s, phone.imu.gyro_rad_s
         if kind == "clipped":
-            log = replace(phone.imu, gyro_rad_s=np.clip(whole, -1.2, 1.2))
+            log = replace(phone.imu, gyro_rad_s=np.clip(whole, -0.5, 0.5))
             stretches = doubtful_stretches(log)
         else:
             stretches = [Stretch("straight", t, t + 0.04, (0, 2)) for t in np.arange(0.3, 2.0, 0.2)]
@@ -593,7 +593,7 @@ def test_a_bridge_without_points_follows_the_readings_around_it(kind: str) -> No
                 without.append(lacking)
     error, std = np.concatenate(errors), np.concatenate(deviations)
     assert len(error) > 100
-    assert np.sqrt(np.mean(error**2)) < 0.5 * np.sqrt(np.mean(np.concatenate(without) ** 2))
+    assert np.sqrt(np.mean(error**2)) < 0.2 * np.sqrt(np.mean(np.concatenate(without) ** 2))
     assert np.mean(np.abs(error) < 2 * std) > 0.9
 
 

@@ -68,12 +68,17 @@ class MeasuredRate:
         return self._denoised(0.0)
 
     def _denoised(self, window_s: float) -> Array:
-        """The same for the rate whose means over this window the denoised samples are."""
+        """The same for the rate whose means over this window the denoised samples are.
+
+        Timestamps jitter: the spline is denoised at even times, since a second derivative would amplify their jitter.
+        """
         rate = self.rate_rad_s.copy()
         for run in runs_without_gap(self.time_s):
             if len(run) >= LEAST_RUN:
-                step_s = float(self.time_s[run[-1]] - self.time_s[run[0]]) / (len(run) - 1)
-                rate[run] = without_noise(rate[run], window_s / step_s)
+                time_s = self.time_s[run]
+                even_s, step_s = np.linspace(time_s[0], time_s[-1], len(run), retstep=True)
+                even = without_noise(CubicSpline(time_s, rate[run])(even_s), window_s / float(step_s))
+                rate[run] = CubicSpline(even_s, even)(time_s)
         return _pieces(self.time_s, rate)
 
 

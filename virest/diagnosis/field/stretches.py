@@ -11,22 +11,18 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy.linalg import block_diag
 
-from virest.arrays import Array, Mask
+from virest.arrays import Mask
 from virest.camera.field import AXES, Field
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.field.forms import FieldForm
 from virest.inference.doubtful_log import CONTRADICTED, Stretch
 from virest.inference.observed_tracks import ObservedTracks
+from virest.inference.untrusted_rates import rates_given_log
 
 KNOT_STEP_S = 0.015
 """Knot spacing of a bridge.  What a clipped peak lacks starts with a kink between two readings: over the peaks of a
 hand at 1 to 2 rad/s, the angle of a spline with this spacing errs by 0.1 mrad in the median and 0.3 mrad at most, about
 a tracker's noise; with twice the spacing by 0.3 and 1.4 mrad."""
-
-LEAST_READINGS, MOST_READINGS = 20, 80
-"""Trusted readings that tell noise and slope, else all do; most readings, about, on which rates are conditioned."""
-LEAST_NOISE_RAD_S = 1e-3
-"""Least noise of a reading: 0.06°/s, a step of a 16-bit gyroscope."""
 
 
 def touching(observed: ObservedTracks, stretches: Iterable[Stretch], to_imu: tuple[float, float]) -> Mask:
@@ -55,7 +51,7 @@ def bridging_form(stretches: Sequence[Stretch], stamp_0_ns: int, imu: ImuSamples
         values, basis = np.zeros((inner + 2, 3)), []
         for axis in stretch.axes:
             untrusted = [other for other in stretches if axis in other.axes]
-            expected, covariance = _given_readings(imu, axis, knots, untrusted)
+            expected, covariance = rates_given_log(imu, axis, knots, untrusted)
             if stretch.kind != CONTRADICTED:
                 values[1:-1, axis] = (expected - np.interp(knots, imu.time_s, imu.gyro_rad_s[:, axis]))[1:-1]
             root = np.zeros((inner + 2, 3, inner))
@@ -65,44 +61,6 @@ def bridging_form(stretches: Sequence[Stretch], stamp_0_ns: int, imu: ImuSamples
         fields.append(Field("rate", ("time",), (tuple(knots.tolist()),), rows, (), stamp_0_ns))
         bases.append(np.concatenate(basis, axis=1))
     return FieldForm(tuple(fields), block_diag(*bases))
-
-
-def _given_readings(imu: ImuSamples, axis: int, time_s: Array, untrusted: Sequence[Stretch]) -> tuple[Array, Array]:
-    """Mean (n,) and covariance (n, n) of an axis's rate at some times, given the readings outside untrusted intervals.
-
-    A Matérn process of smoothness 5/2 (Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, eq 4.17)
-    with the variance of the log and of its slopes over KNOT_STEP_S.
-    """
-    rate, outside = imu.gyro_rad_s[:, axis], np.ones(len(imu), bool)
-    for stretch in untrusted:
-        outside &= (imu.time_s <= stretch.from_s) | (imu.time_s >= stretch.to_s)
-    known_s, known = imu.time_s[outside], rate[outside]
-    usual_s, usual = (known_s, known) if len(known) >= LEAST_READINGS else (imu.time_s, rate)
-    noise = max(float(np.mean(np.diff(usual, 3) ** 2)) / 20, LEAST_NOISE_RAD_S**2)
-    slope = max(_slope_variance(usual_s, usual) - 2 * noise / KNOT_STEP_S**2, noise / KNOT_STEP_S**2)
-    mean, variance = float(rate.mean()), max(float(rate.var()) - noise, noise)
-    length_s = float(np.sqrt(5 / 3 * variance / slope))
-    near = np.flatnonzero((known_s > time_s[0] - 2 * length_s) & (known_s < time_s[-1] + 2 * length_s))
-    near = near[:: len(near) // MOST_READINGS + 1]
-    known_s, known = known_s[near], known[near]
-
-    def covariance(first_s: Array, second_s: Array) -> Array:
-        apart = np.sqrt(5.0) * np.abs(first_s[:, None] - second_s) / length_s
-        return np.asarray(variance * (1 + apart + apart**2 / 3) * np.exp(-apart))
-
-    across = covariance(time_s, known_s)
-    weights = np.linalg.solve(covariance(known_s, known_s) + noise * np.eye(len(known_s)), across.T).T
-    left = covariance(time_s, time_s) - weights @ across.T + LEAST_NOISE_RAD_S**2 * np.eye(len(time_s))
-    return mean + weights @ (known - mean), left
-
-
-def _slope_variance(time_s: Array, rate: Array) -> float:
-    """Mean square slope, (rad/s²)², of a rate (n,) between readings about KNOT_STEP_S apart."""
-    later = np.searchsorted(time_s, time_s + KNOT_STEP_S)
-    first = np.flatnonzero(later < len(time_s))
-    step_s = time_s[later[first]] - time_s[first]
-    near = step_s <= max(2 * KNOT_STEP_S, float(step_s.min()))
-    return float(np.mean(((rate[later[first]] - rate[first])[near] / step_s[near]) ** 2))
 
 
 def axis_names(stretches: Iterable[Stretch]) -> str:
