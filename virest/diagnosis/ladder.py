@@ -32,6 +32,7 @@ from virest.diagnosis.field.brightness import (
     without_flicker,
     without_gain,
 )
+from virest.diagnosis.field.contradicted import known_stretches
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import (
@@ -326,7 +327,8 @@ class DiagnosisSession:
             )
         if is_exposure and change is not None:
             exposure = as_exposure(self.findings, change)
-            points = replace(self.points, start=self.points.start.with_shutter(exposure_scale=change.estimate))
+            start = self.points.start.with_shutter(exposure_scale=change.estimate)
+            points = replace(self.points, start=start, contradicted=known_stretches(self.geometric))
             self.geometric = points.described(points.climbed(progress), self.light.profile)
             self.findings = [exposure, *self._of_points(exposure_s)]
         if any(finding.name == "exposure_time" for finding in self.findings):  # the points determined it better

@@ -25,6 +25,7 @@ from virest.image_formation.light import flicker
 from virest.image_formation.row_clock import RowClock
 from virest.inference import profile_terms as terms_of
 from virest.inference.coarse_alignment import MIN_MOTION_PX, align_coarsely, align_with_skew
+from virest.inference.doubtful_log import Stretch
 from virest.inference.frame_rotations import gyro_turns
 from virest.inference.frame_selection import high_motion_frames
 from virest.inference.observed_tracks import CELLS, ObservedTracks
@@ -76,6 +77,8 @@ class TrackedPoints:
     far: FarStart
     rungs_allowed: int
     each: ParallelMap = one_by_one
+    contradicted: tuple[Stretch, ...] = ()
+    """Intervals of the log of which an earlier climb found that the points contradict them."""
 
     def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
         """Climb the ladder, and climb it again without image regions that move independently, if there are any."""
@@ -116,7 +119,7 @@ class TrackedPoints:
             )  # fmt: skip
 
         if self.rungs_allowed:
-            return climb_with_bridges(observed, self.capture, self.start, climbing)
+            return climb_with_bridges(observed, self.capture, self.start, climbing, self.contradicted)
         evidence = make_evidence(
             self.capture.imu, doubtful_pairs(observed, self.capture, self.start).for_ladder(observed), self.start
         )

@@ -53,8 +53,12 @@ def doubtful_stretches(imu: ImuSamples) -> list[Stretch]:
     """The implausible stretches of the log, in order of time."""
     if len(imu) < 20:
         return []
-    found = [*_straight(imu), *(s for axis in range(3) for s in _clipped(imu, axis))]
-    return sorted(found, key=lambda s: s.from_s)
+    return list(in_order(*_straight(imu), *(s for axis in range(3) for s in _clipped(imu, axis))))
+
+
+def in_order(*stretches: Stretch) -> tuple[Stretch, ...]:
+    """Stretches in order of time."""
+    return tuple(sorted(stretches, key=lambda stretch: stretch.from_s))
 
 
 def doubts(imu: ImuSamples, profile: CameraProfile | None = None) -> list[str]:

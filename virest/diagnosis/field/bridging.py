@@ -37,10 +37,6 @@ MAX_EXCESS_LEFT, MAX_RMS_RATIO = 0.2, 1.5
 """Accept a bridge if less than MAX_EXCESS_LEFT of the excess squared residual remains, or if the residual rms is below
 MAX_RMS_RATIO times the noise."""
 
-SPLINE_ERROR = 0.02
-"""What a bridge's knots leave of a log's error, whose kinks lie between them: 0.3 % in the median, 1.7 % in 1 of 100
-gaps of 50 to 200 ms in the rates of a hand."""
-
 
 @dataclass(frozen=True, slots=True)
 class Doubtful:
@@ -222,13 +218,8 @@ class HeldOutBridges:
         A bridge does not move badly tracked points to where others of their pair are.
         """
         usual_px = self.rms_px(~self.bridges.doubtful.hit)[0]
-        medians_px = self.bridges.evidence.typical_px * pair_medians(self.before, self.table, self.near.shape[1])
-        found = []
-        for pairs in self.near:
-            seen_px = medians_px[pairs & np.isfinite(medians_px)]
-            own_px = SPLINE_ERROR * float(np.linalg.norm(seen_px)) / np.sqrt(max(len(seen_px), 1))
-            found.append(_convicted(*self.rms_px(pairs)[:2], float(np.hypot(usual_px, own_px))))
-        return np.array(found)
+        found = (self.rms_px(pairs) for pairs in self.near)
+        return np.array([_convicted(before, after, usual_px) for before, after, _ in found])
 
     def p_value(self, kind: str) -> float | None:
         """Of residuals near the intervals of a kind being no larger than elsewhere; None without such points.

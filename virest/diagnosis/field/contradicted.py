@@ -7,7 +7,7 @@ all others, and a rate that is free inside it removes them from points that took
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,11 +25,12 @@ from virest.diagnosis.field.bridging import (
     removes_excess,
     with_bridges,
 )
+from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import with_fields
 from virest.diagnosis.geometric_evidence import Evidence, Model, make_evidence
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.inference.chance import chi2_below, normal_deviate, normal_tail
-from virest.inference.doubtful_log import CONTRADICTED, Stretch
+from virest.inference.doubtful_log import CONTRADICTED, Stretch, in_order
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.robust import robust_std
 
@@ -44,20 +45,23 @@ Climb = Callable[[Evidence, Callable[[Model], Model] | None], GeometricVerdict]
 
 
 def climb_with_bridges(
-    observed: ObservedTracks, capture: Capture, start: CameraProfile, climb: Climb
+    observed: ObservedTracks, capture: Capture, start: CameraProfile, climb: Climb, known: Sequence[Stretch] = ()
 ) -> GeometricVerdict:
     """Climb without the pairs in doubtful intervals of the log, and bridge the intervals from their points.
 
     climb: the ladder, from evidence and the estimate of the bridges beside a model (None: there are none).  If the
-    points contradict the log in further intervals, the ladder is climbed again without these.
+    points contradict the log in further intervals, the ladder is climbed again without these.  known: intervals of
+    which another climb found it.
     """
     doubtful = doubtful_pairs(observed, capture, start)
+    if known:
+        doubtful = Doubtful.over(in_order(*doubtful.stretches, *known), observed, start)
     found = _climbed(observed, capture, start, climb, doubtful)
     further = contradicted_stretches(found, capture, start)
     if not further:
         return found
-    stretches = tuple(sorted((*doubtful.stretches, *further), key=lambda stretch: stretch.from_s))
-    bridged = _climbed(observed, capture, start, climb, Doubtful.over(stretches, observed, start))
+    together = Doubtful.over(in_order(*doubtful.stretches, *further), observed, start)
+    bridged = _climbed(observed, capture, start, climb, together)
     bridged.undoubted = found
     return bridged
 
@@ -77,6 +81,12 @@ def with_fields_or_bridges(found: GeometricVerdict, capture: Capture, start: Cam
     if not removes_excess(without.final_rms_px, plain.final_rms_px, told.final_rms_px):
         return told
     return told if contradicted_stretches(plain, capture, start) else plain
+
+
+def known_stretches(found: GeometricVerdict) -> tuple[Stretch, ...]:
+    """The intervals of the log that only a verdict's points contradict, and that it bridges."""
+    told = [stretch for entry in found.fields if isinstance(entry, Distrusted) for stretch in entry.stretches]
+    return tuple(stretch for stretch in told if stretch.kind == CONTRADICTED)
 
 
 def _climbed(

@@ -108,7 +108,6 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
             break
         chosen, entered, after = step
         before, last = entered.before, entered.after
-        after = _with_other_causes(evidence, found, after)
         if after.accepted != state.accepted:
             less = _without_form(after.model, after.forms[-1])
             before, last = (_held_out(evidence, m, fitted, entered.form.local) for m in (less, after.model))
@@ -219,8 +218,12 @@ class _Judged:
 def _best_step(
     judged: _Judged, found: GeometricVerdict, state: _SearchState, alternatives: Sequence[_Proposal]
 ) -> tuple[_Proposal, _Entered, _SearchState] | None:
-    """Add the simplest form, or one with more numbers that predicts held-out points better; None where none gains."""
-    steps = [step for one in alternatives if (step := _step(judged, found, state, one)) is not None]
+    """Add the simplest form, or one with more numbers that predicts held-out points better; None where none gains.
+
+    Each is judged beside the causes that the points need with it: a curve takes some of what a cause left out does.
+    """
+    each = (step for one in alternatives if (step := _step(judged, found, state, one)) is not None)
+    steps = [(one, entered, _with_other_causes(judged.evidence, found, after)) for one, entered, after in each]
     if len(steps) < 2:
         return next(iter(steps), None)
     steps.sort(key=lambda step: step[1].form.basis.shape[1])
