@@ -48,9 +48,9 @@ def seen(true_log: Array, logged: Array, rng: np.random.Generator) -> Photometri
     return replace(lit, log_product=(logged - np.median(logged))[lit.frame])
 
 
-def told(observed: PhotometricObservations, frames: list[Frame]) -> Finding:
+def told(observed: PhotometricObservations, frames: list[Frame], given: CameraProfile = NOMINAL) -> Finding:
     """The only cause, with its rivals."""
-    verdict = PictureVerdict(NOMINAL)
+    verdict = PictureVerdict(given)
     climb_observations(verdict, observed, FRAMES)
     (finding,) = with_followed_log(verdict, frames).findings
     return finding
@@ -63,6 +63,15 @@ def test_an_iso_that_stops_acting_is_a_rival_of_the_light(rng: np.random.Generat
     assert [rival.name for rival in found.rivals] == ["gain over ISO"]
     assert "the gains follow the ISO" in found.sentence
     assert "at one exposure time and several ISO values" in found.sentence
+
+
+def test_gains_beside_given_ones_follow_the_log(rng: np.random.Generator) -> None:
+    """What the profile's own gains leave is a curve over the logged ISO."""
+    known = 0.3 * np.sin(np.arange(FRAMES))
+    given = NOMINAL.with_extensions(gain=tuple(np.exp(known - np.median(known)).tolist()))
+    found = told(seen(known + np.minimum(STEPS, 0.1), STEPS, rng), frames_of(STEPS), given)
+    assert found.name == "gain_drift"
+    assert [rival.name for rival in found.rivals] == ["gain over ISO"]
 
 
 def test_an_iso_that_acts_too_strongly_is_a_rival_of_the_curve(rng: np.random.Generator) -> None:

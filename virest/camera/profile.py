@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from virest.arrays import Array
 from virest.camera.field import Field as ModelField
@@ -65,6 +66,10 @@ class Extensions:
     """θ about x and y at the start of the inertial log; fitted but not stored in files: its effect decays soon."""
     field: tuple[ModelField, ...] = ()
     """Fields other than those that the shutter and the lens hold."""
+
+    def gain_of(self, frames: ArrayLike) -> Array:
+        """Factors on the light of frames, by movie index; 1 where the list has none."""
+        return np.append(self.gain, 1.0)[np.minimum(frames, len(self.gain))]
 
 
 @dataclass(frozen=True, slots=True)

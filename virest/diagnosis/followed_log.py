@@ -193,12 +193,13 @@ def _followed(
     without = _without(profile, given, cause)
     before, after = (normalised_rms(seen, one)[0] for one in (without, profile))
     most_left = after**2 + (1 - RIVAL_GAIN_FRACTION) * (before**2 - after**2)
-    log_gain = np.log([*profile.extensions.gain, *[1.0] * len(frames)][: len(frames)])[seen.frames]
+    own, known = (np.log(one.extensions.gain_of(range(len(frames)))) for one in (profile, without))
     found = []
     for form in possible_forms(frames, seen.frames):
         if cause != "gain_drift" and form.name == TIME:  # a slow drift beside a changing exposure is no curve
             continue
-        effect = FollowedGain(form.basis, np.asarray(np.linalg.lstsq(form.basis[seen.frames], log_gain)[0]))
+        start = np.asarray(np.linalg.lstsq(form.basis[seen.frames], (own - known)[seen.frames])[0])
+        effect = FollowedGain(known, form.basis, start)
         fit = fit_photometry(seen, without, [effect])
         if fit.rms**2 > most_left:
             continue

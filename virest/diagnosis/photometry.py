@@ -131,7 +131,7 @@ def log_light_factor(observations: PhotometricObservations, profile: CameraProfi
         exposure_s = profile.shutter.true_exposure_s(observations.exposure_s)
         total += np.log(np.maximum(flicker(profile, middle_s, exposure_s), 1e-3))
     if ext.gain:
-        total += np.log(np.append(ext.gain, 1.0))[np.minimum(observations.frame, len(ext.gain))]
+        total += np.log(ext.gain_of(observations.frame))
     return total
 
 

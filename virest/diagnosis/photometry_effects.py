@@ -138,8 +138,7 @@ class GainDrift:
 
     def starts(self, observations: PhotometricObservations, profile: CameraProfile) -> list[Array]:
         """The profile's gains."""
-        gain = np.append(profile.extensions.gain, 1.0)
-        return [np.log(gain[np.minimum(self.frames, len(gain) - 1)])]
+        return [np.log(profile.extensions.gain_of(self.frames))]
 
     def seen_in(self, observations: PhotometricObservations) -> GainDrift:
         """The effect with values for its observed frames only; those of other frames are not determined."""
@@ -159,8 +158,10 @@ class GainDrift:
 
 @dataclass(frozen=True, eq=False)
 class FollowedGain:
-    """Log gains of frames as a linear function of some numbers: along something that is logged."""
+    """Log gains of frames, beside the given ones, that are linear in some numbers: along something that is logged."""
 
+    given: Array
+    """(movie frames,) log gains of the profile."""
     basis: Array
     """(movie frames, k) log gain of each frame per number."""
     start: Array
@@ -193,7 +194,9 @@ class FollowedGain:
 
     def apply(self, profile: CameraProfile, values: Array) -> CameraProfile:
         """Set extensions.gain."""
-        return profile.with_extensions(gain=tuple(np.exp(np.clip(self.basis @ values, -3.0, 3.0)).tolist()))
+        return profile.with_extensions(
+            gain=tuple(np.exp(self.given + np.clip(self.basis @ values, -3.0, 3.0)).tolist())
+        )
 
 
 PhotometricEffect = OneValue | Flicker | GainDrift | FollowedGain

@@ -190,8 +190,7 @@ def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: Cam
             logged_s = frame.exposure_s or 0.0
             middle_s = clock.seen_s(rows_px, frame.time_s, logged_s)
             light = flicker(profile, middle_s, shutter.true_exposure_s(logged_s))
-            gain = profile.extensions.gain[index] if index < len(profile.extensions.gain) else 1.0
-            linear = curve.linear_table()[picture] / (light * gain)
+            linear = curve.linear_table()[picture] / (light * profile.extensions.gain_of(index))
             yield index, np.clip(np.rint(255 * curve.encode(linear)), 0, 255).astype(np.uint8)
 
     return corrected

@@ -110,7 +110,7 @@ def from_frame(profile: CameraProfile, frames: Sequence[Frame]) -> CameraProfile
     changed = counted_from(profile, frames[0].time_s, frames[0].timestamp_ns)
     extensions, index = changed.extensions, [frame.index for frame in frames]
     lag_s, lag_frames = _lag_left(extensions, index[0])
-    gain = tuple(extensions.gain[i] if i < len(extensions.gain) else 1.0 for i in index) if extensions.gain else ()
+    gain = tuple(extensions.gain_of(index).tolist()) if extensions.gain else ()
     extensions = dataclasses.replace(
         extensions, gain=gain, frame_lag_s=lag_s, frame_lag_frames=lag_frames, exposures_late_frames=0
     )
@@ -181,9 +181,7 @@ def _logged_focus(frames: Sequence[Frame]) -> Hidden:
 
 def _slot_gain(true: CameraProfile, shows: NDArray[np.int64], slot: int) -> float:
     """Hidden gain of a slot's capture: that of the first slot that shows it."""
-    first = int(np.argmax(shows == shows[slot]))
-    gain = true.extensions.gain
-    return gain[first] if first < len(gain) else 1.0
+    return float(true.extensions.gain_of(int(np.argmax(shows == shows[slot]))))
 
 
 def _require_ahead(motion: HandMotion, view: View, session: Session, shows: NDArray[np.int64]) -> None:

@@ -466,10 +466,9 @@ def _gain(session: Session, slot: int) -> float:
 
     The first slot's gain is used so that repeated frames are identical.
     """
-    gain = session.true.extensions.gain
     capture = int(session.shows[slot])
     first = int(np.argmax(session.shows == capture))
-    return float(session.exposures.light[capture]) * (gain[first] if first < len(gain) else 1.0)
+    return float(session.exposures.light[capture]) * float(session.true.extensions.gain_of(first))
 
 
 def _gyro_rate(session: Session, time_s: Array) -> Array:
