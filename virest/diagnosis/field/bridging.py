@@ -113,10 +113,11 @@ class Bridges:
         return HeldOutBridges(self, bare, table, before, after, noise, np.array(near))
 
     def trimmed(self, model: Model, least_chi2: float) -> list[Stretch]:
-        """The intervals, each from the last knot before those whose rates differ from 0 to the first after them.
+        """The intervals, each from the second knot before those whose rates differ from 0 to the second after them.
 
-        least_chi2: of a knot's rates on the three axes, in their standard deviations.  Without such a knot an interval
-        is dropped.
+        An error that begins at 0 between two knots is still too small to differ at the second of them.  least_chi2: of
+        a knot's rates on the three axes, in their standard deviations.  Without a knot that differs an interval is
+        dropped.
         """
         table = self.evidence.table(model, FINAL_POINTS)
         bare = self.without(_with_scene(self.evidence, replace(model, terms=()), table))
@@ -129,8 +130,8 @@ class Bridges:
             rate, std = np.array(field.values)[1:-1], np.array(field.std)[1:-1]
             differing = 1 + np.flatnonzero(((rate / np.maximum(std, 1e-12)) ** 2).sum(axis=-1) > least_chi2)
             if len(differing):
-                first, last = field.knots[0][differing[0] - 1], field.knots[0][differing[-1] + 1]
-                found.append(replace(stretch, from_s=first, to_s=last))
+                first, last = max(differing[0] - 2, 0), min(differing[-1] + 2, len(field.knots[0]) - 1)
+                found.append(replace(stretch, from_s=field.knots[0][first], to_s=field.knots[0][last]))
         return found
 
 
