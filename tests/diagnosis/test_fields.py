@@ -332,6 +332,20 @@ def test_a_bias_that_drifts_evenly_is_a_line_and_no_bias_beside_a_step() -> None
     assert verdict.final_rms_px < 1.1 * HAND.noise_px
 
 
+def test_axes_that_are_not_perpendicular_keep_their_name_beside_a_bias_that_drifts() -> None:
+    """A curve of the bias with dozens of knots follows the points nearly as well."""
+
+    def log(time_s, reading, force):
+        sheared = reading + 0.03 * reading[:, [1]] * np.array([1.0, 0.0, 0.0])
+        return sheared + np.outer(time_s, [0.024, -0.014, 0.012])
+
+    phone = StrangePhone(HAND, Strange(gyro=log))
+    verdict, (field,) = judged(phone, phone.profile, rungs=2)
+    assert {entry.name for entry in verdict.accepted} == {"gyro_axes", "imu_rotation"}
+    assert verdict.model.profile.extensions.gyro_misalignment_rad[0] == pytest.approx(0.015, abs=0.003)
+    assert (field.kind, field.covariates, field.shape) == ("rate", ("time",), "a straight line")
+
+
 def test_a_bias_beside_a_drift_that_does_not_reach_it_keeps_its_name() -> None:
     """The given bias lies outside the range of the drift."""
     change = np.array([0.01, -0.008, 0.005])

@@ -118,12 +118,13 @@ def climb_on(
     model: Model,
     accepted: tuple[Accepted, ...],
     among: frozenset[str] | None = None,
+    in_pairs: bool = False,
 ) -> tuple[Model, tuple[Accepted, ...]]:
-    """One more rung, of single causes, from a model that holds fields: (model, causes), the same where none enters.
+    """One more rung from a model that holds fields: (model, causes), the same where none enters.
 
-    among: names of the causes that may enter; None: all.
+    among: names of the causes that may enter; None: all.  in_pairs: whether pairs of causes are tried too.
     """
-    context = SearchContext(evidence, nominal, (), FarStart(), one_by_one, among, in_pairs=False)
+    context = SearchContext(evidence, nominal, (), FarStart(), one_by_one, among, in_pairs=in_pairs)
     step, _, rung = _rung(context, model, list(accepted))
     if step is None:
         return model, accepted

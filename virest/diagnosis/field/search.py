@@ -71,6 +71,8 @@ RATE_OVER_TIME, DELAY_OVER_TIME = f"rate{OVER}time", f"delay{OVER}time"
 MIN_DELAY_PART = 2 / 3
 """Least part of the excess residual that delays of single frames, or of a few, remove: of the gyroscope's noise, which
 turns frames about three axes, they remove about a third, and of stamps that jitter all."""
+MAX_RUNGS_BESIDE_FORMS = 3
+"""Most rungs that are climbed beside forms in place of another form or of finer knots."""
 MIN_EXCESS_REMOVED = 0.5
 """Minimum fraction of the excess loss at a sudden change that a fit to the other blocks must remove."""
 
@@ -126,6 +128,15 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
     if not fields:
         return found
+    named = _with_causes_in_place_of_forms(evidence, found, state, fitted)
+    if named is not state:
+        fields = [
+            _judged_again(evidence, named, entry, fitted)
+            for entry in fields
+            if entry.form.name in {form.name for form in named.forms}
+        ]
+        fitted = evidence.fit(named.model, named.model.terms, evidence.table(named.model, FINAL_POINTS))
+        state = replace(named, model=replace(named.model, profile=fitted.profile, scene=fitted.scene))
     table = evidence.table(state.model, FINAL_POINTS)
     fields = [replace(entry, form=form, fit=fitted) for entry, form in zip(fields, state.forms, strict=True)]
     return replace(
@@ -221,9 +232,18 @@ def _best_step(
     """Add the simplest form, or one with more numbers that predicts held-out points better; None where none gains.
 
     Each is judged beside the causes that the points need with it: a curve takes some of what a cause left out does.
+    Where finer knots gain, the coarse ones with further causes, or pairs of them, are an alternative.
     """
-    each = (step for one in alternatives if (step := _step(judged, found, state, one)) is not None)
-    steps = [(one, entered, _with_other_causes(judged.evidence, found, after)) for one, entered, after in each]
+    steps: list[tuple[_Proposal, _Entered, _SearchState]] = []
+    for proposal in alternatives:
+        entries = _entered(judged, proposal)
+        for entered in entries:
+            after = _step(judged, found, state, proposal, entered)
+            if after is not None:
+                coarse = entered is not entries[-1]
+                told = (_climbed if coarse else _with_other_causes)(judged.evidence, found, after)
+                if not coarse or len(told.accepted) > len(after.accepted):
+                    steps.append((proposal, entered, told))
     if len(steps) < 2:
         return next(iter(steps), None)
     steps.sort(key=lambda step: step[1].form.basis.shape[1])
@@ -237,15 +257,13 @@ def _best_step(
 
 
 def _step(
-    judged: _Judged, found: GeometricVerdict, state: _SearchState, proposal: _Proposal
-) -> tuple[_Proposal, _Entered, _SearchState] | None:
-    """Add a proposed form and remove what it makes redundant; None where it gains nothing.
+    judged: _Judged, found: GeometricVerdict, state: _SearchState, proposal: _Proposal, entered: _Entered
+) -> _SearchState | None:
+    """Keep a form that entered and remove what it makes redundant; None where it gains too little.
 
     A form that replaces a cause needs a lower significance than one that is added to all causes.
     """
-    evidence, entered = judged.evidence, _entered(judged, proposal)
-    if entered is None:
-        return None
+    evidence = judged.evidence
     more = _SearchState(entered.model, state.accepted, (*state.forms, entered.form))
     after = _without_redundant_causes(evidence, found, more)
     typical, left = evidence.typical_px, entered.after.rms
@@ -259,7 +277,7 @@ def _step(
         replaces = len(after.accepted) < len(state.accepted)
         if not replaces or not _is_better(judged, after.model, entered.form):
             return None
-    return proposal, entered, after
+    return after
 
 
 def _is_better(judged: _Judged, model: Model, form: FieldForm) -> bool:
@@ -428,8 +446,8 @@ class _Entered:
     after: HeldOut
 
 
-def _entered(judged: _Judged, proposal: _Proposal) -> _Entered | None:
-    """Add a form with as many knots as improve held-out data; None where held-out blocks do not gain."""
+def _entered(judged: _Judged, proposal: _Proposal) -> tuple[_Entered, ...]:
+    """Add a form, and where they improve held-out data finer knots too; empty where held-out blocks do not gain."""
     evidence, model, fitted, form = judged.evidence, judged.model, judged.fitted, proposal.form
     extended = replace(model, terms=(*model.terms, form.term))
     before, after = judged.held_out(form.local), _held_out(evidence, extended, fitted, form.local)
@@ -444,8 +462,10 @@ def _entered(judged: _Judged, proposal: _Proposal) -> _Entered | None:
         holds = bool(gain[there] > MIN_EXCESS_REMOVED * excess)
     least_gain = 0.0 if proposal.instead else MIN_GAIN
     if gain.mean() < least_gain * before.block_loss.mean() or after.rms > before.rms or not holds:
-        return None
-    return _refined(evidence, model, _Entered(extended, form, before, after), fitted)
+        return ()
+    coarse = _Entered(extended, form, before, after)
+    refined = _refined(evidence, model, coarse, fitted)
+    return (coarse,) if refined is coarse else (coarse, refined)
 
 
 def _holds_over_time(gain: Array) -> bool:
@@ -533,6 +553,17 @@ def _without_redundant_causes(evidence: Evidence, found: GeometricVerdict, state
         state = state.without(found, leaving)
 
 
+def _climbed(evidence: Evidence, found: GeometricVerdict, state: _SearchState) -> _SearchState:
+    """Add causes, or pairs of them, beside forms as on the ladder, and remove those that become redundant."""
+    end = state
+    for _ in range(MAX_RUNGS_BESIDE_FORMS):
+        model, accepted = climb_on(evidence, found.nominal.profile, end.model, end.accepted, in_pairs=True)
+        if len(accepted) == len(end.accepted):
+            break
+        end = replace(end, model=model, accepted=accepted)
+    return end if end is state else _without_redundant_causes(evidence, found, end)
+
+
 def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _SearchState) -> _SearchState:
     """Add the cause that the points need beside a new field, and remove what it makes redundant.
 
@@ -547,6 +578,39 @@ def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _Sear
     if len(accepted) == len(state.accepted):
         return state
     return _without_redundant_causes(evidence, found, replace(state, model=model, accepted=accepted))
+
+
+def _with_causes_in_place_of_forms(
+    evidence: Evidence, found: GeometricVerdict, state: _SearchState, fitted: TrackFit
+) -> _SearchState:
+    """A search's end with named causes in place of the form that these replace best; unchanged where they replace none.
+
+    A cause may show only beside a field, and another field that came first may have taken its part: axes that are not
+    perpendicular, beside a bias that drifts, look like a sheared picture.
+    """
+    if len(state.forms) < 2:
+        return state
+    judged, by_point = _Judged(evidence, state.model, fitted), state.is_dense(evidence.period_s)
+    ends: list[tuple[float, _SearchState]] = []
+    for form in state.forms:
+        others = tuple(other for other in state.forms if other is not form)
+        less = replace(state, model=_without_form(state.model, form), forms=others)
+        less = _climbed(evidence, found, less)
+        if len(less.accepted) > len(state.accepted) and not _loses_without(judged, by_point, less.model):
+            ends.append((float(_held_out(evidence, less.model, fitted, by_point).block_loss.mean()), less))
+    if not ends:
+        return state
+    end = min(ends, key=lambda one: one[0])[1]
+    log.debug("causes in place of a form: %s", [entry.name for entry in end.accepted])
+    return end
+
+
+def _judged_again(evidence: Evidence, state: _SearchState, entry: FittedField, fitted: TrackFit) -> FittedField:
+    """A field's entry with the held-out residuals without and with it beside a state's other causes."""
+    form = next(form for form in state.forms if form.name == entry.form.name)
+    models = _without_form(state.model, form), state.model
+    before_px, after_px = (_held_out(evidence, m, fitted, form.local).rms * evidence.typical_px for m in models)
+    return replace(entry, before_px=before_px, after_px=after_px)
 
 
 def _with_level_cause(
