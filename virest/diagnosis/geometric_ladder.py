@@ -335,7 +335,8 @@ def _rung(context: SearchContext, model: Model, accepted: list[Accepted]) -> tup
     rung = Rung(None, {j.candidate.name: j.rms * typical for j in trial.judged}, trial.before.rms * typical, GEOMETRY)
     step, rival = _best_single(model, trial)
     small = step is None or step.part < SMALL_GAIN
-    if context.in_pairs and small and better and min(entry.scale for entry in (base, *better)) > EXCESS_SCALE:
+    scale = base.scale if step is None else min(entry.scale for entry in (base, *better))
+    if context.in_pairs and small and better and scale > EXCESS_SCALE:
         pair, other = _best_pair(context, model, tried, base, better)
         if pair is not None:
             step, rival = pair, other

@@ -72,7 +72,7 @@ MIN_DELAY_PART = 2 / 3
 """Least part of the excess residual that delays of single frames, or of a few, remove: of the gyroscope's noise, which
 turns frames about three axes, they remove about a third, and of stamps that jitter all."""
 MAX_RUNGS_BESIDE_FORMS = 3
-"""Most rungs that are climbed beside forms in place of another form or of finer knots."""
+"""Most rungs that are climbed beside a form."""
 MIN_EXCESS_REMOVED = 0.5
 """Minimum fraction of the excess loss at a sudden change that a fit to the other blocks must remove."""
 
@@ -128,15 +128,6 @@ def with_fields(found: GeometricVerdict, evidence: Evidence, capture: Capture) -
         log.debug("field: %s, p %.2g, beside %s", entered.form.name, chosen.p_value, chosen.rivals)
     if not fields:
         return found
-    named = _with_causes_in_place_of_forms(evidence, found, state, fitted)
-    if named is not state:
-        fields = [
-            _judged_again(evidence, named, entry, fitted)
-            for entry in fields
-            if entry.form.name in {form.name for form in named.forms}
-        ]
-        fitted = evidence.fit(named.model, named.model.terms, evidence.table(named.model, FINAL_POINTS))
-        state = replace(named, model=replace(named.model, profile=fitted.profile, scene=fitted.scene))
     table = evidence.table(state.model, FINAL_POINTS)
     fields = [replace(entry, form=form, fit=fitted) for entry, form in zip(fields, state.forms, strict=True)]
     return replace(
@@ -565,7 +556,7 @@ def _climbed(evidence: Evidence, found: GeometricVerdict, state: _SearchState) -
 
 
 def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _SearchState) -> _SearchState:
-    """Add the cause that the points need beside a new field, and remove what it makes redundant.
+    """Add the causes that the points need beside a new field, and remove what they make redundant.
 
     Before the field, another cause may have compensated for both: a focal drift for a wrong focal length beside a
     gyroscope that feels gravity.  Nothing is sought where the residuals are noise.
@@ -574,43 +565,7 @@ def _with_other_causes(evidence: Evidence, found: GeometricVerdict, state: _Sear
     state = _with_level_cause(evidence, found, state, fitted)
     if fitted.scale < EXCESS_SCALE:
         return state
-    model, accepted = climb_on(evidence, found.nominal.profile, state.model, state.accepted)
-    if len(accepted) == len(state.accepted):
-        return state
-    return _without_redundant_causes(evidence, found, replace(state, model=model, accepted=accepted))
-
-
-def _with_causes_in_place_of_forms(
-    evidence: Evidence, found: GeometricVerdict, state: _SearchState, fitted: TrackFit
-) -> _SearchState:
-    """A search's end with named causes in place of the form that these replace best; unchanged where they replace none.
-
-    A cause may show only beside a field, and another field that came first may have taken its part: axes that are not
-    perpendicular, beside a bias that drifts, look like a sheared picture.
-    """
-    if len(state.forms) < 2:
-        return state
-    judged, by_point = _Judged(evidence, state.model, fitted), state.is_dense(evidence.period_s)
-    ends: list[tuple[float, _SearchState]] = []
-    for form in state.forms:
-        others = tuple(other for other in state.forms if other is not form)
-        less = replace(state, model=_without_form(state.model, form), forms=others)
-        less = _climbed(evidence, found, less)
-        if len(less.accepted) > len(state.accepted) and not _loses_without(judged, by_point, less.model):
-            ends.append((float(_held_out(evidence, less.model, fitted, by_point).block_loss.mean()), less))
-    if not ends:
-        return state
-    end = min(ends, key=lambda one: one[0])[1]
-    log.debug("causes in place of a form: %s", [entry.name for entry in end.accepted])
-    return end
-
-
-def _judged_again(evidence: Evidence, state: _SearchState, entry: FittedField, fitted: TrackFit) -> FittedField:
-    """A field's entry with the held-out residuals without and with it beside a state's other causes."""
-    form = next(form for form in state.forms if form.name == entry.form.name)
-    models = _without_form(state.model, form), state.model
-    before_px, after_px = (_held_out(evidence, m, fitted, form.local).rms * evidence.typical_px for m in models)
-    return replace(entry, before_px=before_px, after_px=after_px)
+    return _climbed(evidence, found, state)
 
 
 def _with_level_cause(
