@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from virest.arrays import Array
-from virest.inference.untrusted_rates import _censored_moments, _truncated
+from virest.capture.imu import ImuSamples
+from virest.inference.doubtful_log import Stretch, doubtful_stretches
+from virest.inference.untrusted_rates import _censored_moments, _truncated, rates_given_log
 
 
 def _smooth(length: float, size: int) -> Array:
@@ -53,3 +55,36 @@ def test_clipped_readings_tell_the_variance_of_the_whole(limits: tuple[float, fl
     assert mean == pytest.approx(0.1, abs=0.05)
     assert np.sqrt(variance) == pytest.approx(0.7, rel=0.06)
     assert read.std() < 0.9 * 0.7
+
+
+def _log(rate: Array, time_s: Array) -> ImuSamples:
+    gyro = np.stack([rate, 0.1 * np.sin(3 * time_s), 0.1 * np.cos(5 * time_s)], axis=1)
+    return ImuSamples(time_s, gyro, np.full_like(gyro, np.nan))
+
+
+def test_rates_lie_beyond_a_limit_but_not_beyond_a_contradicted_reading() -> None:
+    """An interval that only the points contradict bounds no axis, even if its readings have a common largest value."""
+    time_s = np.arange(0, 3, 0.005)
+    log = _log(np.clip(1.5 * np.sin(2 * np.pi * 2 * time_s), -1.0, 1.0), time_s)
+    first = doubtful_stretches(log)[0]
+    assert first.kind == "clipped"
+    knots = np.linspace(first.from_s, first.to_s, 8)[1:-1]
+    expected, _ = rates_given_log(log, 0, knots, [first])
+    assert np.all(expected > 1.0)
+    told = Stretch("contradicted", first.from_s, first.to_s, (0, 1, 2), 1.0, 1e-9)
+    plain, wider = rates_given_log(log, 1, knots, [told])
+    assert np.all(np.abs(plain) < 0.5)
+    without = rates_given_log(log, 1, knots, [Stretch("straight", first.from_s, first.to_s, (0, 1, 2))])
+    assert np.array_equal(plain, without[0])
+    assert np.array_equal(wider, without[1])
+
+
+def test_an_axis_that_is_stuck_has_finite_rates() -> None:
+    """A constant reading is at its limit all the time."""
+    time_s = np.arange(0, 2, 0.005)
+    log = _log(np.full(len(time_s), 0.7), time_s)
+    stretches = [stretch for stretch in doubtful_stretches(log) if stretch.axes == (0,)]
+    knots = np.linspace(0.5, 0.8, 12)
+    expected, covariance = rates_given_log(log, 0, knots, stretches)
+    assert np.isfinite(expected).all()
+    assert np.all(np.linalg.eigvalsh(covariance) > 0)

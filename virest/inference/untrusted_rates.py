@@ -14,7 +14,7 @@ from scipy import special
 
 from virest.arrays import Array
 from virest.capture.imu import ImuSamples
-from virest.inference.doubtful_log import Stretch
+from virest.inference.doubtful_log import CLIPPED, Stretch
 
 SLOPE_STEP_S = 0.015
 """Time between the readings whose difference is a slope: far shorter than a swing of a hand, yet above the noise."""
@@ -37,12 +37,12 @@ def rates_given_log(imu: ImuSamples, axis: int, time_s: Array, untrusted: Sequen
     for stretch in untrusted:
         inside = (imu.time_s > stretch.from_s) & (imu.time_s < stretch.to_s)
         outside &= ~inside
-        if stretch.limit_rad_s is not None and inside.any():
+        if stretch.kind == CLIPPED and inside.any():
             way = np.sign(rate[inside].mean())
             beyond[inside] = way
             clipped_s = imu.time_s[inside]
             at_limit = (time_s >= clipped_s[0]) & (time_s <= clipped_s[-1])
-            side[at_limit], least[at_limit] = way, stretch.limit_rad_s
+            side[at_limit], least[at_limit] = way, stretch.limit_rad_s or 0.0
     known_s, known = imu.time_s[outside], rate[outside]
     usual_s, usual = (known_s, known) if len(known) >= LEAST_READINGS else (imu.time_s, rate)
     noise = max(float(np.mean(np.diff(usual, 3) ** 2)) / 20, LEAST_NOISE_RAD_S**2)
@@ -96,7 +96,7 @@ def _censored_moments(rate: Array, beyond: Array) -> tuple[float, float]:
     beyond: 1 where a value is larger than the reading, -1 where it is smaller, else 0.  The EM algorithm for censored
     values (Dempster, Laird and Rubin 1977, section 4.2).
     """
-    mean, variance = float(rate.mean()), float(rate.var())
+    mean, variance = float(rate.mean()), max(float(rate.var()), LEAST_NOISE_RAD_S**2)
     side = beyond[beyond != 0]
     for _ in range(CENSORED_STEPS if len(side) else 0):
         deviation = np.sqrt(variance)
