@@ -339,7 +339,7 @@ def test_axes_that_are_not_perpendicular_keep_their_name_beside_a_bias_that_drif
         sheared = reading + 0.03 * reading[:, [1]] * np.array([1.0, 0.0, 0.0])
         return sheared + np.outer(time_s, [0.024, -0.014, 0.012])
 
-    phone = StrangePhone(HAND, Strange(gyro=log))
+    phone = StrangePhone(replace(HAND, noise_px=0.25), Strange(gyro=log))
     verdict, (field,) = judged(phone, phone.profile, rungs=2)
     assert {entry.name for entry in verdict.accepted} == {"gyro_axes", "imu_rotation"}
     assert verdict.model.profile.extensions.gyro_misalignment_rad[0] == pytest.approx(0.015, abs=0.003)
