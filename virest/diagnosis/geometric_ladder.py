@@ -118,13 +118,12 @@ def climb_on(
     model: Model,
     accepted: tuple[Accepted, ...],
     among: frozenset[str] | None = None,
-    in_pairs: bool = False,
 ) -> tuple[Model, tuple[Accepted, ...]]:
     """One more rung from a model that holds fields: (model, causes), the same where none enters.
 
-    among: names of the causes that may enter; None: all.  in_pairs: whether pairs of causes are tried too.
+    among: names of the causes that may enter; None: all.
     """
-    context = SearchContext(evidence, nominal, (), FarStart(), one_by_one, among, in_pairs=in_pairs)
+    context = SearchContext(evidence, nominal, (), FarStart(), one_by_one, among)
     step, _, rung = _rung(context, model, list(accepted))
     if step is None:
         return model, accepted
@@ -264,8 +263,6 @@ class SearchContext:
     """Names of the causes that may enter; None: all."""
     bridged: Callable[[Model], Model] | None = None
     """Estimates the rates in doubtful intervals of the log beside a model's causes; None: there are none."""
-    in_pairs: bool = True
-    """Whether pairs of causes are tried where single ones gain little."""
 
     def with_bridges(self, model: Model) -> Model:
         """The model with rates in the doubtful intervals of the log; its scene is refitted to the ladder's pairs."""
@@ -336,7 +333,7 @@ def _rung(context: SearchContext, model: Model, accepted: list[Accepted]) -> tup
     step, rival = _best_single(model, trial)
     small = step is None or step.part < SMALL_GAIN
     scale = base.scale if step is None else min(entry.scale for entry in (base, *better))
-    if context.in_pairs and small and better and scale > EXCESS_SCALE:
+    if small and better and scale > EXCESS_SCALE:
         pair, other = _best_pair(context, model, tried, base, better)
         if pair is not None:
             step, rival = pair, other

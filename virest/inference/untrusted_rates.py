@@ -32,17 +32,14 @@ def rates_given_log(imu: ImuSamples, axis: int, time_s: Array, untrusted: Sequen
     time_s: ascending, IMU clock from stamp_0.  untrusted: stretches that include this axis.
     """
     rate, outside = imu.gyro_rad_s[:, axis], np.ones(len(imu), bool)
-    beyond, least = np.zeros(len(imu)), np.full(len(time_s), -np.inf)
-    side = np.zeros(len(time_s))
+    beyond, side, least = np.zeros(len(imu)), np.zeros(len(time_s)), np.zeros(len(time_s))
     for stretch in untrusted:
         inside = (imu.time_s > stretch.from_s) & (imu.time_s < stretch.to_s)
         outside &= ~inside
-        if stretch.kind == CLIPPED and inside.any():
-            way = np.sign(rate[inside].mean())
-            beyond[inside] = way
-            clipped_s = imu.time_s[inside]
+        if stretch.kind == CLIPPED and stretch.limit_rad_s is not None and inside.any():
+            clipped_s, way = imu.time_s[inside], np.sign(rate[inside].mean())
             at_limit = (time_s >= clipped_s[0]) & (time_s <= clipped_s[-1])
-            side[at_limit], least[at_limit] = way, stretch.limit_rad_s or 0.0
+            beyond[inside], side[at_limit], least[at_limit] = way, way, stretch.limit_rad_s
     known_s, known = imu.time_s[outside], rate[outside]
     usual_s, usual = (known_s, known) if len(known) >= LEAST_READINGS else (imu.time_s, rate)
     noise = max(float(np.mean(np.diff(usual, 3) ** 2)) / 20, LEAST_NOISE_RAD_S**2)

@@ -548,7 +548,7 @@ def _climbed(evidence: Evidence, found: GeometricVerdict, state: _SearchState) -
     """Add causes, or pairs of them, beside forms as on the ladder, and remove those that become redundant."""
     end = state
     for _ in range(MAX_RUNGS_BESIDE_FORMS):
-        model, accepted = climb_on(evidence, found.nominal.profile, end.model, end.accepted, in_pairs=True)
+        model, accepted = climb_on(evidence, found.nominal.profile, end.model, end.accepted)
         if len(accepted) == len(end.accepted):
             break
         end = replace(end, model=model, accepted=accepted)
