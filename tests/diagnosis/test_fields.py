@@ -53,7 +53,7 @@ from virest.inference.term import slopes_of
 from virest.inference.track_fit import Term, TrackFit
 
 HAND = Setup(
-    seed=71, frames=61, points=20, width=640, height=480, centre_px=(323.0, 236.0), readout_direction="top_to_bottom",
+    seed=71, frames=61, points=12, width=640, height=480, centre_px=(323.0, 236.0), readout_direction="top_to_bottom",
     gyro_noise_rad_s=0.001, rate_rad_s=0.8, exposure_swing=0.0,
 )  # fmt: skip
 PER_FORCE = np.array([[0.006, -0.003, 0.0045], [0.0015, 0.0075, -0.003], [-0.0045, 0.003, 0.006]])
@@ -217,7 +217,7 @@ def test_a_focal_length_that_holds_at_some_focus_distance_is_no_error(given: flo
 def test_a_focal_length_that_holds_at_no_focus_distance_is_named() -> None:
     """The profile lies 3 % outside the range that a breathing of 2 % covers."""
     breathing = Strange(longer=lambda t: 0.01 * focus_dioptres(t) - 0.05, focus_dioptres=focus_dioptres)
-    phone = StrangePhone(replace(HAND, seed=75), breathing)
+    phone = StrangePhone(replace(HAND, seed=75, points=20), breathing)
     verdict, (field,) = judged(phone, phone.profile)
     assert [entry.name for entry in verdict.accepted] == ["focal_length"]
     assert field.covariates == ("focus",)
@@ -378,7 +378,7 @@ def test_an_interval_that_only_the_points_contradict_is_bridged(rng: np.random.G
     def log(time_s, reading, force):
         return filled(1.0, 1.15)(time_s, reading, force) + rng.normal(0, 0.004, reading.shape)
 
-    phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=log))
+    phone = StrangePhone(replace(HAND, seed=77, points=20), Strange(gyro=log))
     assert not doubtful_stretches(phone.imu)
     verdict, (field,) = judged(phone, phone.profile, rungs=1)
     assert not verdict.accepted
@@ -397,7 +397,7 @@ def test_an_interval_that_another_climb_found_is_bridged_from_the_start(rng: np.
     def log(time_s, reading, force):
         return filled(1.0, 1.15)(time_s, reading, force) + rng.normal(0, 0.004, reading.shape)
 
-    phone = StrangePhone(replace(HAND, seed=77), Strange(gyro=log))
+    phone = StrangePhone(replace(HAND, seed=77, points=20), Strange(gyro=log))
     known = (Stretch("contradicted", 0.99, 1.16, (0, 1, 2), p_value=1e-9),)
     climbs = []
 
@@ -643,7 +643,7 @@ def test_two_unknown_effects_at_once_are_two_fields() -> None:
 
 def test_calibrate_uses_the_delay_field_of_a_profile() -> None:
     """With a delay over the row, offset and readout time are estimated correctly, and the field stays."""
-    phone = StrangePhone(replace(HAND, seed=85), Strange(late_s=late_s))
+    phone = StrangePhone(replace(HAND, seed=85, points=20), Strange(late_s=late_s))
     rows = Field("delay", ("row",), ((0.0, 0.25, 0.5, 0.75, 1.0),), ((0.0,), (0.0015,), (0.002,), (0.0015,), (0.0,)))
     given = phone.profile.with_fields([rows])
     given = replace(given, time_offset_s=phone.setup.time_offset_s - 0.004)
@@ -926,7 +926,7 @@ def test_a_local_distortion_takes_a_finer_map() -> None:
 def test_a_changing_readout_is_a_delay_over_row_and_time() -> None:
     """Neither covariate alone describes it, and no compensating cause stays in the model."""
     phone = StrangePhone(
-        replace(HAND, seed=94), Strange(late_in_frame_s=lambda row, stamp_s: 0.0025 * row * (stamp_s > 1))
+        replace(HAND, seed=94, points=20), Strange(late_in_frame_s=lambda row, stamp_s: 0.0025 * row * (stamp_s > 1))
     )
     verdict, (field,) = judged(phone, phone.profile, rungs=2)
     assert not verdict.accepted

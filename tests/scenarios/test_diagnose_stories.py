@@ -98,10 +98,12 @@ def test_an_uncatalogued_fault_is_described(work: Path) -> None:
     assert field.held_out.after < 1.5 * field.held_out.noise < 0.1 * field.held_out.before
 
 
-def _diagnosed(folder: Path, hidden: Hidden, seed: int, exposures_s: tuple[float, ...]) -> Diagnosis:
+def _diagnosed(folder: Path, hidden: Hidden, seed: int, exposures_s: tuple[float, ...], width: int = 480) -> Diagnosis:
     """The diagnosis of a capture whose phone has a hidden fault; at 120 Hz, its readout lasts three periods."""
-    nominal = nominal_camera(480, 360, focal_px=400.0, readout_time_s=0.025, response=ResponseCurve("srgb"))
-    settings = SessionSettings(scene="photographs", frames=60, exposure_s=exposures_s, rate_rad_s=1.1, seed=seed)
+    lens = {"focal_px": width / 1.2, "readout_time_s": 0.025, "response": ResponseCurve("srgb")}
+    nominal = nominal_camera(width, width * 3 // 4, **lens)  # type: ignore[arg-type]
+    frames = width // 8
+    settings = SessionSettings(scene="photographs", frames=frames, exposure_s=exposures_s, rate_rad_s=1.1, seed=seed)
     options = RecordingOptions(bits_per_px=0.4, truth_frames=False)
     write_recording(plan_session(nominal, nominal, settings, hidden=hidden), folder, options=options)
     return diagnose_folder(folder)
@@ -110,7 +112,7 @@ def _diagnosed(folder: Path, hidden: Hidden, seed: int, exposures_s: tuple[float
 def test_exposures_logged_for_other_frames_are_the_only_finding(work: Path) -> None:
     """Neither stamps that jitter nor brightness that drifts; the extended profile gives each frame its own exposure."""
     exposures_s = tuple((0.01 * (1 + 0.5 * np.sin(np.arange(60) / 2))).tolist())
-    found = _diagnosed(work / "late_exposures", Hidden(exposures_late_frames=2), 424, exposures_s)
+    found = _diagnosed(work / "late_exposures", Hidden(exposures_late_frames=2), 424, exposures_s, width=320)
     assert not found.causes
     (field,) = found.fields
     assert (field.kind, field.size) == ("exposure_rows", 2.0)
