@@ -204,6 +204,10 @@ def test_a_slope_of_the_light_is_not_a_gain_drift(rng: np.random.Generator) -> N
     assert slope.finding.shape == SLOPE
     assert slope.finding.confounded == ("gain_drift",)
     walk = np.cumsum(rng.normal(size=FRAMES))
+    jitter = 0.008 * rng.normal(size=FRAMES)[observed.frame]  # gains too small to be told
+    both = named(dimmed(observed, (1 - 0.15 * observed.x_px / 639) * np.exp(jitter)))["gain_drift"]
+    assert both.observations is not None
+    assert instead_of_gain(both.observations, both.profile) is not None
     drift = named(dimmed(observed, np.exp(0.15 * walk / np.ptp(walk))[observed.frame]))["gain_drift"]
     assert drift.observations is not None
     assert instead_of_gain(drift.observations, drift.profile) is None

@@ -18,6 +18,9 @@ from virest.camera.profile import CameraProfile
 from virest.diagnosis.field.screening import MAX_P, MIN_BLOCKS, MIN_T, RIVAL_GAIN_FRACTION, Design, score_forms
 from virest.diagnosis.findings import PHOTOMETRY, FieldFinding, HeldOutGain
 from virest.diagnosis.photometry import PhotometricObservations, Prediction, predict
+from virest.diagnosis.photometry_effects import GainDrift
+from virest.diagnosis.photometry_fit import fit_photometry, significance
+from virest.diagnosis.selection import LIGHT_LEVELS
 from virest.inference.chance import t_ratio
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
 
@@ -174,7 +177,8 @@ def instead_of_gain(observations: PhotometricObservations, profile: CameraProfil
     """The constant map that explains the same residuals as the profile's gain per frame; None where there is none.
 
     Where all patches move alike, a slope of the light looks like a gain that follows the viewing direction.  If a few
-    constant numbers remove nearly as much as one gain per frame, they are the likelier reason.
+    constant numbers remove nearly as much as one gain per frame, or leave no significant gain beside them, they are the
+    likelier reason.
     """
     if not profile.extensions.gain:
         return None
@@ -183,9 +187,18 @@ def instead_of_gain(observations: PhotometricObservations, profile: CameraProfil
         return None
     before = found.held_out.before**2
     by_gain = before - _left_by(_thinned(observations), profile) ** 2
-    if before - found.held_out.after**2 < RIVAL_GAIN_FRACTION * by_gain:
+    removes_as_much = before - found.held_out.after**2 >= RIVAL_GAIN_FRACTION * by_gain
+    if not removes_as_much and _gains_are_significant(observations, with_light_field(without_gain(profile), found)):
         return None
     return replace(found, rivals=("gain_drift",))
+
+
+def _gains_are_significant(observations: PhotometricObservations, profile: CameraProfile) -> bool:
+    """Whether the frames have gains of their own beside the profile's light."""
+    frames = tuple(observations.frames.tolist())
+    gains = GainDrift(frames, frames[-1] + 1)
+    fitted = fit_photometry(observations, profile, [gains])
+    return LIGHT_LEVELS.significant(significance(fitted, gains.name, observations, profile)[1])
 
 
 def without_flicker(profile: CameraProfile) -> CameraProfile:
