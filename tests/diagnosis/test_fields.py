@@ -11,6 +11,7 @@ import pytest
 from diagnosis.strange_phone import Strange, StrangePhone
 from motion.synthetic_tracks import Setup
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from virest.calibration.geometry import calibrate_geometry
 from virest.camera.field import Field, cardinal_weights
@@ -51,6 +52,7 @@ from virest.inference.doubtful_log import Stretch, doubtful_stretches
 from virest.inference.profile_terms import FOCAL_DRIFT, GYRO_BIAS, K1, PRINCIPAL_POINT
 from virest.inference.term import slopes_of
 from virest.inference.track_fit import Term, TrackFit
+from virest.motion.integration import missing_rate_rad_s
 
 HAND = Setup(
     seed=71, frames=61, points=12, width=640, height=480, centre_px=(323.0, 236.0), readout_direction="top_to_bottom",
@@ -989,6 +991,43 @@ def test_a_gyroscope_whose_scale_drifts_is_a_rate_over_rate_and_time() -> None:
     assert not verdict.accepted
     assert (field.kind, field.covariates) == ("rate", ("rate", "time"))
     assert gained(field) > 0.8
+
+
+def test_a_gyroscope_that_is_knocked_is_turned_from_an_instant_on() -> None:
+    """The angle is found; a rotation of the IMU for the whole capture would leave half of the error."""
+    slip = np.array([0.03, -0.015, 0.02])
+
+    def log(time_s, reading, _force):
+        return np.where((time_s > 1.13)[:, None], Rotation.from_rotvec(slip).apply(reading), reading)
+
+    phone = StrangePhone(replace(HAND, seed=97, frames=46), Strange(gyro=log))
+    verdict, (field,) = judged(phone, phone.profile)
+    assert not verdict.accepted
+    assert (field.kind, field.covariates, field.shape) == ("rate", ("rate", "time"), "a step")
+    assert "from 1.1" in field.sentence
+    assert field.size is not None
+    assert field.std is not None
+    assert abs(field.size - np.linalg.norm(slip)) < 3 * field.std < 0.005
+    assert verdict.final_rms_px < 1.1 * HAND.noise_px
+
+
+def test_the_form_of_a_turning_gyroscope_holds_its_rates() -> None:
+    """They are the cross products of a turn and the rates, at any time."""
+    phone = StrangePhone(HAND, Strange())
+    (form,) = (f for f in forms_of_pairs(phone.capture, phone.profile, (0.0, 2.0)) if f.is_turn)
+    knots = np.array(form.fields[0].knots[1])
+    turn = np.outer(knots, [0.02, -0.01, 0.015])
+    rates = np.eye(3) * [field.knots[0][-1] for field in form.fields]
+    corners = [np.stack([-np.cross(turn, rate), np.cross(turn, rate)]) for rate in rates]
+    numbers = form.basis.T @ np.concatenate([part.ravel() for part in corners])
+    profile = phone.profile.with_fields(form.filled(numbers))
+    rate_rad_s = profile.true_rate_rad_s(phone.imu.gyro_rad_s)
+    inside = (phone.imu.time_s > knots[0]) & (phone.imu.time_s < knots[-1])
+    wanted = np.cross(np.outer(phone.imu.time_s, [0.02, -0.01, 0.015]), rate_rad_s)
+    missing = missing_rate_rad_s(phone.imu, profile)
+    assert missing is not None
+    np.testing.assert_allclose(missing[inside], wanted[inside], atol=2e-6)
+    assert form.can_hold(profile)
 
 
 def test_an_exposure_that_a_field_has_replaced_is_not_in_the_extended_profile() -> None:

@@ -95,7 +95,7 @@ def forms_of_pairs(
     """
     times = _rounded(_times(span_s, *TIME_STEPS[0]))
     stamp = capture.stamp_0_ns
-    forms = []
+    forms: list[FieldForm] = []
     if profile.shutter.readout_time_s > 0:
         rows, later = np.linspace(0, 1, PAIR_KNOTS), [np.eye(PAIR_KNOTS)[:, 1:]]
         late = _zero("delay", ("row", TIME), [rows, np.asarray(profile.camera_time_s(times))], stamp)
@@ -114,10 +114,11 @@ def forms_of_pairs(
         assert log is not None
         drawn = _zero("scale", ("radius", "focus"), [radii, np.array(dioptres)], None, log)
         forms.append(_product((drawn,), outwards, np.array(log[1]), LENSES, known))
-    reaches = [np.array([-reach, reach]) for reach in _reaches(profile.true_rate_rad_s(capture.imu.gyro_rad_s))]
-    rates = tuple(_zero("rate", (name, TIME), [ends, times], stamp) for name, ends in zip(RATES, reaches, strict=True))
+    rates = _over_rates_and_time(capture, profile, times)
     odd = [np.array([[-1.0], [1.0]]) / np.sqrt(2)] * 3
-    return [*forms, _product(rates, odd, None, GYROS, known)]
+    made = _product(rates, odd, None, GYROS, known), _turn_form(rates, known)
+    families = {form.family for form in made}
+    return forms + [form for form in made if not families - {form.family} & known]  # they share their knots
 
 
 def _product(
@@ -140,6 +141,50 @@ def _product(
     bases = [np.kron(np.kron(along, changing), axes[:, k : k + 1]) for k, along in enumerate(first)]
     again: Recipe = lambda _profile, now: _product(fields, first, logged, steady, now)  # noqa: E731
     return FieldForm(fields, np.asarray(block_diag(*bases)), build=again, refine=refine)
+
+
+def _over_rates_and_time(capture: Capture, profile: CameraProfile, times: Array) -> tuple[Field, ...]:
+    """Fields of value 0 over each axis's rate, up to the highest, and the time."""
+    reaches = _reaches(profile.true_rate_rad_s(capture.imu.gyro_rad_s))
+    ends = [np.array([-reach, reach]) for reach in reaches]
+    return tuple(
+        _zero("rate", (name, TIME), [end, times], capture.stamp_0_ns) for name, end in zip(RATES, ends, strict=True)
+    )
+
+
+def _turn_form(fields: tuple[Field, ...], known: frozenset[str]) -> FieldForm:
+    """A gyroscope that turns on the camera, by an angle over the time, in the fields of :func:`_over_rates_and_time`.
+
+    If a rotation of the IMU is in the model, the angle has no mean.
+    """
+    count = len(fields[0].knots[1])
+    free = null_space(np.ones((1, count))) if "imu_rotation" in known else np.eye(count)
+    refine: Recipe | None = None
+    if (more := 2 * count - 1) <= MOST_PAIR_KNOTS[TIME]:
+        finer = tuple(_with_knots(field, more) for field in fields)
+        refine = lambda _profile, now: _turn_form(finer, now)  # noqa: E731
+    again: Recipe = lambda _profile, now: _turn_form(fields, now)  # noqa: E731
+    return FieldForm(fields, _turned(fields, free), build=again, refine=refine, is_turn=True)
+
+
+def _turned(fields: tuple[Field, ...], free: Array) -> Array:
+    """Basis of the rates that a gyroscope misreads which has turned by an angle θ: θ × ω, to first order.
+
+    free: (knots over the time, n) values of each component of θ per free number.
+    """
+    across = np.cross(np.eye(3)[None, :], np.eye(3)[:, None])  # (axis of the rate, axis of the turn, components)
+    ends = (np.array(field.knots[0])[:, None] for field in fields)
+    basis = np.concatenate([np.kron(np.kron(end, free), own.T) for end, own in zip(ends, across, strict=True)])
+    return np.asarray(basis / np.linalg.norm(basis, axis=0))
+
+
+def turn_steps(capture: Capture, profile: CameraProfile, at_s: Array) -> list[FieldForm]:
+    """A gyroscope that turns on the camera all at once.  One form per instant (n,), IMU clock."""
+    forms = []
+    for time_s in at_s:
+        fields = _over_rates_and_time(capture, profile, _rounded(time_s + STEP_EDGE_S * np.array([-0.5, 0.5])))
+        forms.append(FieldForm(fields, _turned(fields, np.array([[0.0], [1.0]])), float(time_s), is_turn=True))
+    return forms
 
 
 def _with_knots(field: Field, count: int) -> Field:

@@ -26,7 +26,7 @@ STD = {"delay": 0.01, "displacement": 30.0, "scale": 0.2, "rate": 1.0}
 """Prior σ of a free number, 10 times the usual size in phones: it only regularises undetermined numbers."""
 QUOTIENT = {"delay": 1e-4, "displacement": 0.1, "scale": 1e-4, "rate": 2e-3}
 """Step of the difference quotients, in the unit of the values."""
-TIME, EXPOSURE, OVER = "time", "exposure", " over "
+TIME, EXPOSURE, TURN, OVER = "time", "exposure", "turn", " over "
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +47,8 @@ class FieldForm:
     """Builds the same with more knots; None: the maximum is reached."""
     by_frame: bool = False
     """Whether it has a knot at the start of each frame, so that no frame says anything about another."""
+    is_turn: bool = False
+    """Whether its rates are those that a sensor misreads which turns on the camera: θ × ω with an angle θ."""
 
     @property
     def kind(self) -> str:
@@ -62,7 +64,7 @@ class FieldForm:
     @property
     def family(self) -> str:
         """Kind and covariates."""
-        return f"{self.kind}{OVER}{', '.join(self.covariates)}"
+        return f"{TURN if self.is_turn else self.kind}{OVER}{', '.join(self.covariates)}"
 
     @property
     def covariates(self) -> tuple[str, ...]:

@@ -341,7 +341,7 @@ def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: Track
             form = best_instant(seen, capture, form.step_s, scale, evidence.period_s)
         plain.append(_Proposal(form, selection, instead=instead))
         if form.family in (RATE_OVER_TIME, DELAY_OVER_TIME):
-            stepped = lasting_step(seen, tangent, capture, span_s, evidence.period_s, form.kind)
+            stepped = lasting_step(seen, tangent, capture, span_s, evidence.period_s, form)
             plain.append(_Proposal(stepped, selection, instead=instead))
     yield tuple(plain)
     forms = [form for form in (*forms, *pairs) if form.local or (form.is_pair and form.family not in in_model)]
@@ -349,6 +349,9 @@ def _proposals(evidence: Evidence, capture: Capture, model: Model, fitted: Track
     tangent = np.concatenate([tangent, *map(search.effect, smooth)], axis=-1)
     selection = search.best(search.scored(tangent, forms))
     close = [] if selection is None else [_Proposal(forms[selection.best.index], selection)]
+    if selection is not None and close[0].form.is_turn:
+        stepped = lasting_step(seen, tangent, capture, span_s, evidence.period_s, close[0].form)
+        close.append(_Proposal(stepped, selection))
     seen_s = np.concatenate([table.first_stamp_s, table.second_stamp_s])
     late = form_of_late_frames(capture, fitted.profile, span_s, seen_s, frozenset(in_model))
     if late is not None and late.family not in in_model:

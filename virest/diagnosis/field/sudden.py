@@ -14,7 +14,7 @@ from scipy.special import digamma, polygamma
 from virest.arrays import Array
 from virest.capture.records import Capture
 from virest.diagnosis.field.design import PointResiduals
-from virest.diagnosis.field.form_list import FRAMES_PER_STEP, candidate_steps_s, step_forms
+from virest.diagnosis.field.form_list import FRAMES_PER_STEP, candidate_steps_s, step_forms, turn_steps
 from virest.diagnosis.field.forms import FieldForm
 from virest.image_formation.point_model import seen_s
 from virest.inference.chance import student_tail
@@ -148,9 +148,9 @@ def lasting_step(
     capture: Capture,
     span_s: tuple[float, float],
     period_s: float,
-    kind: str,
+    like: FieldForm,
 ) -> FieldForm:
-    """The form of a sudden change of a kind at the instant that explains most beside the tangent space (n, 2, m).
+    """A sudden change of what a form changes, at the instant that explains most beside the tangent space (n, 2, m).
 
     A bias that a phone corrects while it logs, or a clock that it sets, changes between two readings, which a curve
     through knots follows only with overshoots.
@@ -166,9 +166,10 @@ def lasting_step(
         return float(np.sum((np.linalg.qr(own)[0].T @ error) ** 2))
 
     def forms(at_s: Array) -> list[FieldForm]:
-        return step_forms(capture, at_s, kind, seen.fit.profile)
+        profile = seen.fit.profile
+        return turn_steps(capture, profile, at_s) if like.is_turn else step_forms(capture, at_s, like.kind, profile)
 
-    if kind == "delay":  # the pair of frames around it moves most, so that no other instant is near the best
+    if like.kind == "delay":  # the pair of frames around it moves most, so that no other instant is near the best
         seen_s = np.unique(np.concatenate([seen.table.first_stamp_s, seen.table.second_stamp_s]))
         return max(forms(np.asarray(seen.fit.profile.imu_time_s((seen_s[1:] + seen_s[:-1]) / 2))), key=explained)
     near_s = max(forms(candidate_steps_s(span_s, capture)), key=explained).step_s

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from virest.arrays import Array
-from virest.camera.field import FORCES, KINDS, RATES, UNIT_SCALES, Field
-from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S
+from virest.camera.field import FORCES, KINDS, RATES, UNIT_SCALES, Field, interpolated
+from virest.diagnosis.field.forms import FORCE_REACH_M_S2, SENSORS, STEP_EDGE_S, TURN
 from virest.diagnosis.field.records import Distrusted, FittedField
 from virest.diagnosis.field.stretches import axis_names
 from virest.diagnosis.findings import GEOMETRY, FieldFinding, HeldOutGain
@@ -124,6 +124,16 @@ PATTERNS: dict[tuple[str, tuple[str, ...]], Pattern] = {
         "a sensor that warms up or changes its range, or a phone that corrects its scale while it logs",
         "turn the phone on a table by a known angle, again and again from a cold start",
     ),
+    (TURN, ("rate", "time")): Pattern(
+        "the gyroscope turns on the camera by {size} over the capture, {shape} of time",
+        "a lens or sensor that its stabiliser tilts, a mount that slips, or a hinge between camera and gyroscope",
+        "film a board at rest before and after a shake, and calibrate the rotation of the IMU from each half",
+    ),
+    (TURN, ("step",)): Pattern(
+        "from {at} s on the gyroscope is turned by {size} on the camera",
+        "a mount that slips, a hinge between camera and gyroscope, or a knock",
+        "film a board before and after, and calibrate the rotation of the IMU from each part",
+    ),
     ("rate", ("time",)): Pattern(
         "the gyroscope's bias changes by up to {size} over the capture, {shape} of time",
         "the sensor warms up, or the phone corrects its bias while it logs",
@@ -139,13 +149,17 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
     fields, form = entry.fields, entry.form
     shape = shape_of(fields[0]) if len(fields) == 1 else _common_shape(fields)
     size, std = _size(fields)
-    pattern = PATTERNS[form.kind, form.covariates]
+    pattern = PATTERNS[TURN if form.is_turn else form.kind, form.covariates]
+    factor, unit = UNIT_SCALES[form.kind]
+    if form.is_turn:
+        shape, size, std = _turn(fields)
+        factor, unit = 1e3, "mrad"
     if form.by_frame and is_jitter(late_s := np.array(fields[0].values)[:, 0]):
         shape, pattern = JITTER, PATTERNS[form.kind, ("frame",)]
         size, std = _rms_of(late_s, np.array(fields[0].std)[:, 0])
-    if form.kind == "delay" and form.step_s is not None:
-        pattern = PATTERNS[form.kind, ("step",)]
-    factor, unit = UNIT_SCALES[form.kind]
+    sudden = TURN if form.is_turn else form.kind, ("step",)
+    if form.step_s is not None and sudden in PATTERNS:
+        pattern = PATTERNS[sudden]
     amount = f"{size * factor:.3g} {unit}"
     sentence = pattern.sentence.format(
         size=amount,
@@ -154,7 +168,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
         lateness=_lateness(fields[0]),
         lens=lens_words(shape),
         rates=_at_rates(fields[0]),
-        at=f"{fields[0].knots[0][0]:.2f}",
+        at=f"{fields[0].knots[-1][0]:.2f}",
     )
     rms = f" (points {entry.before_px:.3g} px → {entry.after_px:.3g} px, held out)"
     beside = f"; in this capture {' and '.join(entry.rivals)} would explain it equally well" if entry.rivals else ""
@@ -164,7 +178,7 @@ def finding_of(entry: FittedField | Distrusted, noise_px: float) -> FieldFinding
         shape,
         sentence + rms + beside,
         size,
-        _unit(form.kind, form.covariates),
+        "rad" if form.is_turn else _unit(form.kind, form.covariates),
         std,
         HeldOutGain(GEOMETRY, entry.before_px, entry.after_px, noise_px),
         entry.p_value,
@@ -395,6 +409,23 @@ def _size(fields: tuple[Field, ...]) -> tuple[float, float | None]:
     if fields[0].covariates[0] in FORCES:
         return best / FORCE_REACH_M_S2, None if std is None else std / FORCE_REACH_M_S2
     return best, std
+
+
+def _turn(fields: tuple[Field, ...]) -> tuple[str, float, float | None]:
+    """Of the angle θ whose rates θ × ω the fields hold: shape over time, largest change in rad, its deviation."""
+    ends = zip(fields, (field.knots[0][-1] for field in fields), strict=True)
+    x, y, z = (np.array(field.values).reshape(len(field.knots[0]), -1, 3)[-1] / reach for field, reach in ends)
+    angle = 0.5 * np.stack([y[:, 2] - z[:, 1], z[:, 0] - x[:, 2], x[:, 1] - y[:, 0]], axis=-1)
+    apart = np.linalg.norm(angle[:, None] - angle[None, :], axis=-1)
+    axis = int(np.argmax(np.ptp(angle, axis=0)))
+    along = np.linspace(fields[0].knots[1][0], fields[0].knots[1][-1], SAMPLES)
+    curve = interpolated(fields[0].knots[1], angle, along)[:, axis]
+    std = None
+    if fields[0].std:
+        rows = [np.array(f.std).reshape(len(f.knots[0]), -1, 3)[-1] / f.knots[0][-1] for f in fields]
+        std = float(np.linalg.norm(np.median(rows, axis=1)))
+    shape = "a step" if fields[0].knots[1][-1] - fields[0].knots[1][0] < 2 * STEP_EDGE_S else curve_shape(curve, "time")
+    return shape, float(apart.max()), std
 
 
 def _unit(kind: str, covariates: tuple[str, ...]) -> str:
