@@ -7,6 +7,7 @@ readings accumulate at their largest value.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,8 @@ LEAST_PILED, PILED_RUN = 6, 3
 PILE_RATIO = 4.0
 """Smallest ratio of the readings at the limit to those in an equally wide band below: 2.4 for the top of an unclipped
 swing, whatever the width."""
+SAME_LIMIT = 0.02
+"""Largest difference between the limits of two axes, relative: biases of 0.02 rad/s at 1 rad/s."""
 LEAST_LIMIT = 0.5
 """Smallest largest reading one way, over that of both ways: an axis that hardly turns that way reaches no limit."""
 
@@ -53,7 +56,7 @@ def doubtful_stretches(imu: ImuSamples) -> list[Stretch]:
     """The implausible stretches of the log, in order of time."""
     if len(imu) < 20:
         return []
-    return list(in_order(*_straight(imu), *(s for axis in range(3) for s in _clipped(imu, axis))))
+    return list(in_order(*_straight(imu), *_clipped(imu)))
 
 
 def in_order(*stretches: Stretch) -> tuple[Stretch, ...]:
@@ -95,35 +98,70 @@ def _straight(imu: ImuSamples) -> list[Stretch]:
     return stretches
 
 
-def _clipped(imu: ImuSamples, axis: int) -> list[Stretch]:
-    """Runs of readings at the axis's largest value one way or the other, if readings accumulate there."""
-    rate, time_s, end = imu.gyro_rad_s[:, axis], imu.time_s.tolist(), len(imu) - 1
+def _clipped(imu: ImuSamples) -> list[Stretch]:
+    """Runs of readings at the sensor's limit, on each axis and either way.
+
+    A sensor has one range for all its axes.  Once readings pile up at a limit on one of them, fewer swings show that
+    another has reached it.
+    """
+    ways = [(axis, way * imu.gyro_rad_s[:, axis]) for axis in range(3) for way in (1, -1)]
+    largest = np.abs(imu.gyro_rad_s).max(axis=0)
+    piles = [_pile(reading, LEAST_LIMIT * float(largest[axis])) for axis, reading in ways]
+    limits = [limit for limit in piles if limit is not None]
+    time_s, end = imu.time_s.tolist(), len(imu) - 1
     found = []
-    for reading in (rate, -rate):
-        at_limit = _at_limit(reading, LEAST_LIMIT * float(np.abs(rate).max()))
-        limit = float(np.median(reading[at_limit])) if at_limit.any() else None
-        found += [
-            Stretch(CLIPPED, time_s[max(first - 1, 0)], time_s[min(last + 1, end)], (axis,), limit)
-            for first, last in _runs(at_limit)
-        ]
+    for (axis, reading), own in zip(ways, piles, strict=True):
+        limit = own or next((pile for pile in map(partial(_same_pile, reading), limits) if pile is not None), None)
+        if limit is not None:
+            found += [
+                Stretch(CLIPPED, time_s[max(first - 1, 0)], time_s[min(last + 1, end)], (axis,), limit.rate_rad_s)
+                for first, last in _runs(reading >= limit.least_rad_s)
+            ]
     return found
 
 
-def _at_limit(reading: Array, least: float) -> Mask:
-    """Which readings (n,) accumulate at the largest, in the narrowest pile; none if the largest is below ``least``."""
-    limit, none = float(reading.max()), np.zeros(len(reading), bool)
+@dataclass(frozen=True, slots=True)
+class _Pile:
+    """Readings that accumulate at the largest."""
+
+    rate_rad_s: float
+    """Their median."""
+    least_rad_s: float
+    """As far below it as the largest is above: noise after the limit spreads them both ways."""
+
+
+def _pile(reading: Array, least: float) -> _Pile | None:
+    """The narrowest pile of readings (n,) at the largest of them; None if that is below ``least``."""
+    limit = float(reading.max())
     if limit <= least:
-        return none
-    swings = _runs(np.asarray(reading > limit / 2))
+        return None
     for part, least_swings in PILES:
-        at_limit: Mask = np.asarray(reading >= (1 - part) * limit)
-        below = int((reading >= (1 - 2 * part) * limit).sum() - at_limit.sum())
-        longest = max(last - first + 1 for first, last in _runs(at_limit))
-        reached = sum(bool(at_limit[first : last + 1].any()) for first, last in swings)
-        piled = at_limit.sum() >= max(LEAST_PILED, PILE_RATIO * (below + 1))
-        if piled and longest >= PILED_RUN and reached >= least_swings:
-            return at_limit
-    return none
+        if _is_pile(reading, part * limit, least_swings):
+            middle = float(np.median(reading[reading >= (1 - part) * limit]))
+            return _Pile(middle, min(2 * middle - limit, (1 - part) * limit))
+    return None
+
+
+def _same_pile(reading: Array, known: _Pile) -> _Pile | None:
+    """The pile of readings (n,) at another axis's limit, as wide as there; None where they are no pile, or go beyond.
+
+    Axes differ by their biases, of at most SAME_LIMIT.
+    """
+    limit, width = float(reading.max()), known.rate_rad_s - known.least_rad_s
+    if abs(limit - known.rate_rad_s - width) > SAME_LIMIT * known.rate_rad_s or not _is_pile(reading, 2 * width, 1):
+        return None
+    return _Pile(limit - width, limit - 2 * width)
+
+
+def _is_pile(reading: Array, width: float, least_swings: int) -> bool:
+    """Whether readings (n,) accumulate within a width of the largest, in at least so many swings."""
+    limit = float(reading.max())
+    at_limit: Mask = np.asarray(reading >= limit - width)
+    below = int((reading >= limit - 2 * width).sum() - at_limit.sum())
+    longest = max(last - first + 1 for first, last in _runs(at_limit))
+    reached = sum(bool(at_limit[first : last + 1].any()) for first, last in _runs(np.asarray(reading > limit / 2)))
+    piled = at_limit.sum() >= max(LEAST_PILED, PILE_RATIO * (below + 1))
+    return bool(piled and longest >= PILED_RUN and reached >= least_swings)
 
 
 def _runs(mask: Mask) -> list[tuple[int, int]]:
