@@ -578,6 +578,9 @@ def test_a_bridge_that_does_not_explain_its_points_is_withheld_from_the_profile(
     assert field.fields == (good,)
     assert field.held_out.noise == 0.1
     assert "1 of 2 bridged from the points, the others not corrected by process" in field.sentence
+    assert not entry.better_than_none
+    clipped = tuple(replace(stretch, kind="clipped", limit_rad_s=1.0) for stretch in stretches)
+    assert replace(entry, stretches=clipped).better_than_none == ((1.5, 1.6),)
 
 
 def test_the_knots_of_a_bridge_resolve_a_clipped_peak() -> None:

@@ -410,10 +410,13 @@ class DiagnosisSession:
         left = remaining_structure(self.geometric, light)
         first, observed = self.first, self.points.observed
         stated = [entry for field in fields for entry in field.fields]
-        withheld = [f for entry in self.geometric.fields if isinstance(entry, Distrusted) for f in entry.withheld]
+        distrusted = [entry for entry in self.geometric.fields if isinstance(entry, Distrusted)]
+        withheld = [field for entry in distrusted for field in entry.withheld]
+        trusted = {interval for entry in distrusted for interval in entry.better_than_none}
         kept = [held for held in extended.fields if not any(map(held.is_in_place_of, withheld))]
         with_std = [next((s for s in stated if s.is_in_place_of(held)), held) for held in kept]
-        extended = extended.with_fields([held.rounded() for held in with_std])
+        untrusted = tuple(interval for interval in extended.imu_untrusted_s if interval not in trusted)
+        extended = replace(extended.with_fields([held.rounded() for held in with_std]), imu_untrusted_s=untrusted)
         extended = with_unknowns_of(self.geometric, extended)
         # the stabiliser's lean belongs to the start of this log: a restoration that begins later must not use it
         without_lean = extended.with_extensions(stabilisation_lean_rad=(0.0, 0.0))

@@ -8,7 +8,7 @@ import numpy as np
 
 from virest.camera.field import Field
 from virest.diagnosis.field.forms import FieldForm
-from virest.inference.doubtful_log import Stretch
+from virest.inference.doubtful_log import CLIPPED, Stretch
 from virest.inference.track_fit import TrackFit
 
 
@@ -60,3 +60,9 @@ class Distrusted:
     def withheld(self) -> tuple[Field, ...]:
         """Bridges that join the motion on both sides of their interval, but do not explain the points inside."""
         return tuple(field for field, usable in zip(self.bridges, self.usable, strict=True) if not usable)
+
+    @property
+    def better_than_none(self) -> tuple[tuple[float, float], ...]:
+        """Intervals at the limit without a usable bridge: the readings are too small, but nearer to the truth than 0."""
+        pairs = zip(self.stretches, self.usable, strict=True)
+        return tuple((s.from_s, s.to_s) for s, usable in pairs if s.kind == CLIPPED and not usable)
