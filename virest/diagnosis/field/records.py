@@ -63,6 +63,6 @@ class Distrusted:
 
     @property
     def better_than_none(self) -> tuple[tuple[float, float], ...]:
-        """Intervals at the limit without a usable bridge: the readings are too small, but nearer to the truth than 0."""
+        """Intervals at the limit without a usable bridge: readings too small, but nearer to the truth than 0."""
         pairs = zip(self.stretches, self.usable, strict=True)
         return tuple((s.from_s, s.to_s) for s, usable in pairs if s.kind == CLIPPED and not usable)
