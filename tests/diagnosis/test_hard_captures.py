@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnosis.strange_phone import Strange, StrangePhone
 from motion.synthetic_tracks import Recording, Setup
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +20,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
 from virest.diagnosis import photometry_fit
 from virest.diagnosis.ambiguities import offset_as_timestamp, offset_beside_averaging
+from virest.diagnosis.candidates import FarStart
 from virest.diagnosis.findings import CONSISTENT, GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Model, make_evidence
@@ -30,7 +32,7 @@ from virest.diagnosis.local_blur_spectra import bin_count, join_ratios
 from virest.diagnosis.photometry_effects import GainDrift
 from virest.diagnosis.photometry_fit import fit_photometry, significance
 from virest.diagnosis.picture_ladder import changes_of, frames_of, values_of
-from virest.diagnosis.tracking_stage import with_null_values
+from virest.diagnosis.tracking_stage import TrackedPoints, stands_out_across, with_null_values
 from virest.inference import profile_terms as terms_of
 from virest.motion.integration import integrate_gyro
 
@@ -54,6 +56,50 @@ def test_a_camera_at_rest_is_consistent_without_exposures(at_rest: Path) -> None
     assert (found.verdict, found.causes) == (CONSISTENT, ())
     assert any("at rest" in note for note in found.notes)
     assert any("known exposures" in note and "blur was not tested" in note for note in found.notes)
+
+
+class BoardBeforeWall(StrangePhone):
+    """Points in the middle of the picture are on a board before the wall, at rest or moving on their own."""
+
+    moves = False
+
+    def _on_board(self, way: np.ndarray) -> np.ndarray:
+        middle = self.orientation(np.array([self.stamp_s.mean()])).inv().apply(way)
+        return np.asarray((np.abs(middle[:, :2] / middle[:, 2:]) < (0.22, 0.28)).all(axis=1))
+
+    def _inverse_depth(self, way: np.ndarray, start: np.ndarray) -> np.ndarray:
+        wall = super()._inverse_depth(way, start)
+        return wall if self.moves else np.where(self._on_board(way), 0.9, wall)
+
+    def _project(self, way: np.ndarray, start: np.ndarray, inverse: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+        seen = super()._project(way, start, inverse, time_s)
+        own = np.stack([30 * np.sin(3 * time_s), 20 * np.cos(2 * time_s)], axis=-1)
+        return seen + own * self._on_board(way)[:, None] * self.moves
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_board_before_a_wall_does_not_move_independently(moves: bool) -> None:
+    """Its points differ from the wall's along the parallax alone; those of a moving object do not."""
+    setup = replace(HAND, points=60, sway_m=0.15, plane_per_m=(0.0, 0.0, 0.33), accel_bias_m_s2=(0.0, 0.0, 0.0))
+    phone = BoardBeforeWall(setup, Strange())
+    phone.moves = moves
+    start = replace(phone.profile, depth_m=None)
+    points = TrackedPoints(phone.capture, phone.observed, start, (), (), FarStart(), 1)
+    found = points.climbed(lambda _: None)
+    assert not found.accepted
+    assert (found.independent_share > 0.1) == moves
+    assert not moves or any("move independently" in note for note in found.notes)
+
+
+def test_points_at_another_depth_stand_out_along_the_parallax_alone(rng: np.random.Generator) -> None:
+    """A motion of their own stands out across it too; without parallax nothing tells a depth."""
+    along_px = rng.normal(size=(400, 2))
+    noise_px, part = np.full(400, 0.1), np.arange(400) < 80
+    nearer = rng.normal(0, 0.1, (400, 2)) + part[:, None] * 2.0 * along_px
+    moving = rng.normal(0, 0.1, (400, 2)) + part[:, None] * np.array([1.5, -0.5])
+    for left, way, stands_out in ((nearer, along_px, False), (moving, along_px, True), (nearer, None, True)):
+        fitted = SimpleNamespace(along_px=way, difference_px=left, noise_px=noise_px)
+        assert stands_out_across(fitted, part) is stands_out  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("turned_deg", [(90, 0, 0), (0, 0, 180), (0, -90, 90)])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from virest.arrays import Array, Index
+from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.records import NO_STAMP, Capture, Frame
 from virest.diagnosis.candidates import FarStart
@@ -28,10 +28,11 @@ from virest.inference.coarse_alignment import MIN_MOTION_PX, align_coarsely, ali
 from virest.inference.doubtful_log import Stretch
 from virest.inference.frame_rotations import gyro_turns
 from virest.inference.frame_selection import high_motion_frames
-from virest.inference.observed_tracks import CELLS, ObservedTracks
+from virest.inference.observed_tracks import ASTRAY, CELLS, ObservedTracks
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.recorder_lag import Schedule
-from virest.inference.track_fit import Term
+from virest.inference.track_evidence import lengths_and_ways
+from virest.inference.track_fit import Term, TrackFit
 from virest.inference.track_noise import step_noise_px
 from virest.motion.integration import integrate_gyro
 
@@ -81,7 +82,11 @@ class TrackedPoints:
     """Intervals of the log of which an earlier climb found that the points contradict them."""
 
     def climbed(self, progress: Callable[[float], None]) -> GeometricVerdict:
-        """Climb the ladder, and climb it again without image regions that move independently, if there are any."""
+        """Climb the ladder, and climb it again without image regions that move otherwise, if there are any.
+
+        Regions whose residuals stand out along the parallax alone are nearer or further than the rest of the scene,
+        and do not move independently.
+        """
         found = self._climbed(self.observed, progress)
         if not self.rungs_allowed:
             return found
@@ -97,8 +102,10 @@ class TrackedPoints:
             return found
         rest = self.observed.without_cells(cells)
         again = self._climbed(replace(rest, noise_px=step_noise_px(rest.pairs)), progress)
-        again.independent_share = share
-        again.notes.append(f"{share:.0%} of the points lie in image regions that move independently and were excluded")
+        if stands_out_across(found.fit, independent):
+            again.independent_share = share
+        how = "move independently" if again.independent_share else "are nearer or further than the others"
+        again.notes.append(f"{share:.0%} of the points lie in image regions that {how} and were excluded")
         return again
 
     def described(self, found: GeometricVerdict, lit: CameraProfile) -> GeometricVerdict:
@@ -126,6 +133,16 @@ class TrackedPoints:
         found = climbing(evidence, None)
         found.evidence = evidence
         return found
+
+
+def stands_out_across(fitted: TrackFit, part: Mask) -> bool:
+    """Whether some points' residuals exceed those of the others across the parallax, too; without parallax they do."""
+    if fitted.along_px is None:
+        return True
+    way = lengths_and_ways(fitted.along_px)[1]
+    left = fitted.difference_px / fitted.noise_px[:, None]
+    across = np.abs(left[:, 1] * way[:, 0] - left[:, 0] * way[:, 1])
+    return float(np.median(across[part])) > ASTRAY * float(np.median(across[~part]))
 
 
 def _common_motion(difference_px: Array, group: Index) -> float:
