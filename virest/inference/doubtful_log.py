@@ -137,8 +137,7 @@ def _pile(reading: Array, least: float) -> _Pile | None:
         return None
     for part, least_swings in PILES:
         if _is_pile(reading, part * limit, least_swings):
-            middle = float(np.median(reading[reading >= (1 - part) * limit]))
-            return _Pile(middle, min(2 * middle - limit, (1 - part) * limit))
+            return _pile_within(reading, part * limit)
     return None
 
 
@@ -147,10 +146,17 @@ def _same_pile(reading: Array, known: _Pile) -> _Pile | None:
 
     Axes differ by their biases, of at most SAME_LIMIT.
     """
-    limit, width = float(reading.max()), known.rate_rad_s - known.least_rad_s
-    if abs(limit - known.rate_rad_s - width) > SAME_LIMIT * known.rate_rad_s or not _is_pile(reading, 2 * width, 1):
+    width = 2 * (known.rate_rad_s - known.least_rad_s)
+    apart = abs(float(reading.max()) - known.least_rad_s - width)
+    if apart > SAME_LIMIT * known.rate_rad_s or not _is_pile(reading, width, 1):
         return None
-    return _Pile(limit - width, limit - 2 * width)
+    return _pile_within(reading, width)
+
+
+def _pile_within(reading: Array, width: float) -> _Pile:
+    limit = float(reading.max())
+    middle = float(np.median(reading[reading >= limit - width]))
+    return _Pile(middle, min(2 * middle - limit, limit - width))
 
 
 def _is_pile(reading: Array, width: float, least_swings: int) -> bool:

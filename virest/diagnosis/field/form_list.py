@@ -168,7 +168,7 @@ def _turn_form(fields: tuple[Field, ...], known: frozenset[str]) -> FieldForm:
 
 
 def _turned(fields: tuple[Field, ...], free: Array) -> Array:
-    """Basis of the rates that a gyroscope misreads which has turned by an angle θ: θ × ω, to first order.
+    """Basis of the rates θ × ω that a gyroscope turned by an angle θ misreads, to first order.
 
     free: (knots over the time, n) values of each component of θ per free number.
     """

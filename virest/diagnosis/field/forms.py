@@ -48,7 +48,7 @@ class FieldForm:
     by_frame: bool = False
     """Whether it has a knot at the start of each frame, so that no frame says anything about another."""
     is_turn: bool = False
-    """Whether its rates are those that a sensor misreads which turns on the camera: θ × ω with an angle θ."""
+    """Whether it is a gyroscope that turns on the camera by an angle θ, and so misreads its rates ω by θ × ω."""
 
     @property
     def kind(self) -> str:
