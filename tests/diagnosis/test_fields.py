@@ -32,6 +32,7 @@ from virest.diagnosis.field.contradicted import (
     climb_with_bridges,
     contradicted_stretches,
     known_stretches,
+    spans_of_outliers,
     with_fields_or_bridges,
 )
 from virest.diagnosis.field.design import point_residuals
@@ -428,6 +429,14 @@ def test_a_badly_tracked_pair_is_no_interval_of_the_log(rng: np.random.Generator
     medians = pair_medians(found.fit.distance, found.table, len(pairs))
     assert medians[20:22].min() > 5 * np.median(medians)
     assert not contradicted_stretches(found, phone.capture, phone.profile)
+
+
+@pytest.mark.filterwarnings("error")
+def test_pairs_that_do_not_count_contradict_no_interval() -> None:
+    """With too few points in every pair there is no usual residual."""
+    phone = StrangePhone(HAND, Strange())
+    unknown = np.full(len(phone.observed.pairs), np.nan)
+    assert not spans_of_outliers(phone.observed, Model(phone.profile, None, ()), unknown)
 
 
 @pytest.mark.parametrize("late_s", [0.02, 0.05])

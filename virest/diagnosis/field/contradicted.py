@@ -114,7 +114,7 @@ def contradicted_stretches(found: GeometricVerdict, capture: Capture, start: Cam
     medians = pair_medians(distance, found.table, len(observed.pairs))
     late = {frame.index for frame in capture.frames if frame.only_startup}
     medians[[bool({pair.first, pair.second} & late) for pair in observed.pairs]] = np.nan
-    spans = _spans(observed, model, medians)
+    spans = spans_of_outliers(observed, model, medians)
     if not spans:
         return []
     whole = Bridges.over(Doubtful.over(spans, observed, start), observed, capture, start)
@@ -145,11 +145,13 @@ def _common_limit(imu: ImuSamples, stretches: list[Stretch]) -> float | None:
     return float(largest[np.any(reached, axis=0)].min())
 
 
-def _spans(observed: ObservedTracks, model: Model, medians: Array) -> list[Stretch]:
+def spans_of_outliers(observed: ObservedTracks, model: Model, medians: Array) -> list[Stretch]:
     """Intervals, IMU clock, seen by runs of pairs whose median residuals (pairs,) are outliers among all pairs'.
 
     The logarithm of a pair's median is taken for normally distributed; nan: the pair does not count.
     """
+    if not np.isfinite(medians).any():
+        return []
     level = np.log(np.maximum(medians, np.finfo(float).tiny))
     level -= np.nanmedian(level)
     deviation = level / max(robust_std(level[np.isfinite(level)]), np.finfo(float).tiny)
