@@ -25,9 +25,9 @@ JUDGE_POINTS = 3500
 LAGGING_BLOCK = 2
 """Pairs per block among those that a start-up lag moves: only neighbouring pairs share a frame and its errors."""
 
-FIRST_ITERATIONS, SURVIVORS, SURVIVING_STARTS = 1, 3, 2
-"""Iterations of all candidates in the first round, from slopes that they share; causes that continue, as a multiple of
-the count wanted; and starting points kept per cause."""
+FIRST_ITERATIONS, SURVIVORS, SURVIVING_STARTS = 2, 3, 2
+"""Iterations of all candidates in the first round; causes that continue, as a multiple of the count wanted; and
+starting points kept per cause."""
 
 SCENE_ROUNDS, NEAR_LOSS, LEAST_GAIN = 3, 1.5, 0.01
 """Rounds in which judged causes are fitted from the best one's scene; they end when none gains LEAST_GAIN of its loss.
