@@ -24,7 +24,7 @@ from virest.diagnosis.candidates import FarStart
 from virest.diagnosis.findings import CONSISTENT, GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
 from virest.diagnosis.geometric_evidence import Model, make_evidence
-from virest.diagnosis.geometric_ladder import climb
+from virest.diagnosis.geometric_ladder import climb, differ_by_simpler
 from virest.diagnosis.geometric_significance import p_if_plausible
 from virest.diagnosis.local_blur import MEMORY, _recent
 from virest.diagnosis.local_blur_model import transfers
@@ -32,6 +32,7 @@ from virest.diagnosis.local_blur_spectra import bin_count, join_ratios
 from virest.diagnosis.photometry_effects import GainDrift
 from virest.diagnosis.photometry_fit import fit_photometry, significance
 from virest.diagnosis.picture_ladder import changes_of, frames_of, values_of
+from virest.diagnosis.residual_tests import points_left
 from virest.diagnosis.tracking_stage import TrackedPoints, stands_out_across, with_null_values
 from virest.inference import profile_terms as terms_of
 from virest.motion.integration import integrate_gyro
@@ -77,6 +78,16 @@ class BoardBeforeWall(StrangePhone):
         return seen + own * self._on_board(way)[:, None] * self.moves
 
 
+def test_a_filter_is_no_better_end_than_a_delay_that_leaves_as_much() -> None:
+    """Statistics of blocks alone would tell them apart by the tracker's own errors."""
+    delay, filtered, other = (
+        SimpleNamespace(accepted=[SimpleNamespace(name=name)]) for name in ("time_offset", "gyro_lowpass", "clock_skew")
+    )
+    assert differ_by_simpler(delay, filtered, 0.1)  # type: ignore[arg-type]
+    assert not differ_by_simpler(delay, filtered, 0.3)  # type: ignore[arg-type]
+    assert not differ_by_simpler(delay, other, 0.1)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_board_before_a_wall_does_not_move_independently(moves: bool) -> None:
     """Its points differ from the wall's along the parallax alone; those of a moving object do not."""
@@ -89,6 +100,8 @@ def test_a_board_before_a_wall_does_not_move_independently(moves: bool) -> None:
     assert not found.accepted
     assert (found.independent_share > 0.1) == moves
     assert not moves or any("move independently" in note for note in found.notes)
+    left = points_left(found)
+    assert (left.significant, left.only_strays) == (moves, moves)
 
 
 def test_points_at_another_depth_stand_out_along_the_parallax_alone(rng: np.random.Generator) -> None:

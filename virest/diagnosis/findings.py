@@ -142,6 +142,8 @@ class Remaining:
     quantity: str
     significant: bool
     sentence: str = ""
+    only_strays: bool = False
+    """Whether only points that move on their own are left: the model holds for the rest of the scene."""
 
     @property
     def unit(self) -> str:

@@ -190,7 +190,7 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
     one, other = judge(evidence, ends, min(first.fit.scale, second.fit.scale), spread, one_by_one)
     worse = t_ratio(other.block_loss - one.block_loss)
     better = first if worse > 0 else second
-    if abs(worse) >= RIVAL_T:
+    if abs(worse) >= RIVAL_T and not differ_by_simpler(first, second, abs(one.rms**2 - other.rms**2)):
         return better
     chosen, rival = sorted(
         (first, second),
@@ -215,6 +215,15 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
         )
     chosen.rival = rival
     return chosen
+
+
+def differ_by_simpler(first: GeometricVerdict, second: GeometricVerdict, apart: float) -> bool:
+    """Whether two ends differ by causes with a simpler alternative, and by no more than tracking errors do.
+
+    apart: difference of their squared residuals, in units of the noise, as in :func:`_is_simpler`.
+    """
+    simple = [{SIMPLER.get(entry.name, entry.name) for entry in end.accepted} for end in (first, second)]
+    return simple[0] == simple[1] and apart < STRUCTURE_NOISES**2
 
 
 def _less_simple(names: set[str]) -> int:

@@ -312,12 +312,12 @@ class DiagnosisSession:
         return offset_beside_averaging(found)
 
     def judge_blur(self, gray: Reader, progress: Callable[[float], None]) -> None:
-        """Judge blur unless point residuals are significant; blur distinguishes a wrong exposure from a time offset."""
+        """Judge blur unless the scene's points disagree; blur distinguishes a wrong exposure from a time offset."""
         self.blur = PictureVerdict(self.light.profile)
         exposure_s = self.points.observed.exposure_s
         change = exposure_hypothesis(self.findings, exposure_s, self.geometric.nominal.profile)
         hypothesis, is_exposure = None if change is None else float(change.estimate), False
-        if points_left(self.geometric).significant:
+        if _disagree(self.geometric):
             self.notes.append("tracked points disagree with the model: blur and the exposure curve were not tested")
         else:
             lit = merged(self.geometric.model.profile, self.light.profile, self.light.profile, False)
@@ -342,7 +342,7 @@ class DiagnosisSession:
         """Estimate the curve from how blur mixes light, where the blur paths are accurate."""
         assert self.curve is not None
         extended = self.curve.profile
-        if points_left(self.geometric).significant:
+        if _disagree(self.geometric):
             return
         if _paths_uncertain(extended, self.geometric):
             if self.light.observations is None or not light_varies(self.light.observations):
@@ -442,6 +442,12 @@ class DiagnosisSession:
 def with_exposure_of(light: PictureVerdict, moved: CameraProfile) -> PictureVerdict:
     """A verdict on brightness with another profile's exposure scale, whose cause a field may have replaced since."""
     return replace(light, profile=light.profile.with_shutter(exposure_scale=moved.shutter.exposure_scale))
+
+
+def _disagree(found: GeometricVerdict) -> bool:
+    """Whether the points contradict the model, beyond those that move on their own."""
+    left = points_left(found)
+    return left.significant and not left.only_strays
 
 
 def _needs_fields(points: TrackedPoints, found: GeometricVerdict) -> bool:

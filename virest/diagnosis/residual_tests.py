@@ -81,7 +81,7 @@ def points_left(geometric: GeometricVerdict) -> Remaining:
     if strays:
         sentence = f"{stray:.0%} of the points move on their own"
         p_value = None if geometric.independent_share > STRAY_PART else p_stray
-        return Remaining(p_value, "place", strongest.size, limit, GEOMETRY, True, sentence)
+        return Remaining(p_value, "place", strongest.size, limit, GEOMETRY, True, sentence, only_strays=True)
     return Remaining(strongest.p_value, strongest.along, strongest.size, limit, GEOMETRY, False)
 
 
