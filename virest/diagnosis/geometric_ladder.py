@@ -190,7 +190,8 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
     one, other = judge(evidence, ends, min(first.fit.scale, second.fit.scale), spread, one_by_one)
     worse = t_ratio(other.block_loss - one.block_loss)
     better = first if worse > 0 else second
-    if abs(worse) >= RIVAL_T and not differ_by_simpler(first, second, abs(one.rms**2 - other.rms**2)):
+    nyquist_hz = 0.5 / float(np.median(np.diff(evidence.imu.time_s)))
+    if abs(worse) >= RIVAL_T and not differ_by_delay(first, second, nyquist_hz):
         return better
     chosen, rival = sorted(
         (first, second),
@@ -217,13 +218,14 @@ def _better_end(evidence: Evidence, first: GeometricVerdict, second: GeometricVe
     return chosen
 
 
-def differ_by_simpler(first: GeometricVerdict, second: GeometricVerdict, apart: float) -> bool:
-    """Whether two ends differ by causes with a simpler alternative, and by no more than tracking errors do.
+def differ_by_delay(first: GeometricVerdict, second: GeometricVerdict, nyquist_hz: float) -> bool:
+    """Whether two ends differ by a low-pass filter above a log's Nyquist frequency: in the log it is a delay alone.
 
-    apart: difference of their squared residuals, in units of the noise, as in :func:`_is_simpler`.
+    Blocks share errors of the tracker, and their statistics would tell such a filter from a time offset.
     """
     simple = [{SIMPLER.get(entry.name, entry.name) for entry in end.accepted} for end in (first, second)]
-    return simple[0] == simple[1] and apart < STRUCTURE_NOISES**2
+    cutoff_hz = max(end.model.profile.extensions.gyro_lowpass_hz for end in (first, second))
+    return simple[0] == simple[1] and cutoff_hz > nyquist_hz
 
 
 def _less_simple(names: set[str]) -> int:
