@@ -59,6 +59,17 @@ def test_a_camera_at_rest_is_consistent_without_exposures(at_rest: Path) -> None
     assert any("known exposures" in note and "blur was not tested" in note for note in found.notes)
 
 
+def test_a_filter_above_the_log_s_nyquist_frequency_is_a_delay() -> None:
+    """Statistics of blocks alone would tell them apart by the tracker's own errors."""
+
+    def end(name: str, cutoff_hz: float = 0.0) -> SimpleNamespace:
+        profile = CameraProfile(64, 48).with_extensions(gyro_lowpass_hz=cutoff_hz)
+        return SimpleNamespace(accepted=[SimpleNamespace(name=name)], model=SimpleNamespace(profile=profile))
+
+    for cutoff_hz, name, expected in ((190.0, "time_offset", True), (60.0, "time_offset", False), (190.0, "k1", False)):
+        assert differ_by_delay(end(name), end("gyro_lowpass", cutoff_hz), 100.0) is expected  # type: ignore[arg-type]
+
+
 class BoardBeforeWall(StrangePhone):
     """Points in the middle of the picture are on a board before the wall, at rest or moving on their own."""
 
@@ -76,17 +87,6 @@ class BoardBeforeWall(StrangePhone):
         seen = super()._project(way, start, inverse, time_s)
         own = np.stack([30 * np.sin(3 * time_s), 20 * np.cos(2 * time_s)], axis=-1)
         return seen + own * self._on_board(way)[:, None] * self.moves
-
-
-def test_a_filter_above_the_log_s_nyquist_frequency_is_a_delay() -> None:
-    """Statistics of blocks alone would tell them apart by the tracker's own errors."""
-
-    def end(name: str, cutoff_hz: float = 0.0) -> SimpleNamespace:
-        profile = CameraProfile(64, 48).with_extensions(gyro_lowpass_hz=cutoff_hz)
-        return SimpleNamespace(accepted=[SimpleNamespace(name=name)], model=SimpleNamespace(profile=profile))
-
-    for cutoff_hz, name, expected in ((190.0, "time_offset", True), (60.0, "time_offset", False), (190.0, "k1", False)):
-        assert differ_by_delay(end(name), end("gyro_lowpass", cutoff_hz), 100.0) is expected  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("moves", [False, True])

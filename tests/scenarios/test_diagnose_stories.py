@@ -100,8 +100,9 @@ def test_an_uncatalogued_fault_is_described(work: Path) -> None:
 
 def _diagnosed(folder: Path, hidden: Hidden, seed: int, exposures_s: tuple[float, ...], width: int = 480) -> Diagnosis:
     """The diagnosis of a capture whose phone has a hidden fault; at 120 Hz, its readout lasts three periods."""
-    lens = {"focal_px": width / 1.2, "readout_time_s": 0.025, "response": ResponseCurve("srgb")}
-    nominal = nominal_camera(width, width * 3 // 4, **lens)  # type: ignore[arg-type]
+    nominal = nominal_camera(
+        width, width * 3 // 4, focal_px=width / 1.2, readout_time_s=0.025, response=ResponseCurve("srgb")
+    )
     frames = width // 8
     settings = SessionSettings(scene="photographs", frames=frames, exposure_s=exposures_s, rate_rad_s=1.1, seed=seed)
     options = RecordingOptions(bits_per_px=0.4, truth_frames=False)

@@ -136,7 +136,7 @@ class TrackedPoints:
 
 
 def stands_out_across(fitted: TrackFit, part: Mask) -> bool:
-    """Whether some points' residuals exceed those of the others across the parallax, too; without parallax they do."""
+    """Whether some points' residuals exceed the others' across the parallax too; True without parallax."""
     if fitted.along_px is None:
         return True
     way = lengths_and_ways(fitted.along_px)[1]

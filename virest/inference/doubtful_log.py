@@ -154,13 +154,14 @@ def _same_pile(reading: Array, known: _Pile) -> _Pile | None:
 
 
 def _pile_within(reading: Array, width: float) -> _Pile:
+    """The pile around the median of the readings (n,) within ``width`` of the largest one."""
     limit = float(reading.max())
     middle = float(np.median(reading[reading >= limit - width]))
     return _Pile(middle, min(2 * middle - limit, limit - width))
 
 
 def _is_pile(reading: Array, width: float, least_swings: int) -> bool:
-    """Whether readings (n,) accumulate within a width of the largest, in at least so many swings."""
+    """Whether readings (n,) accumulate within ``width`` of the largest one, in ``least_swings`` swings or more."""
     limit = float(reading.max())
     at_limit: Mask = np.asarray(reading >= limit - width)
     below = int((reading >= limit - 2 * width).sum() - at_limit.sum())

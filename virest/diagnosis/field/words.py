@@ -5,6 +5,7 @@ A pattern is kind × covariates × shape.  Shapes come from least-squares fits t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -413,19 +414,27 @@ def _size(fields: tuple[Field, ...]) -> tuple[float, float | None]:
 
 def _turn(fields: tuple[Field, ...]) -> tuple[str, float, float | None]:
     """Of the angle θ whose rates θ × ω the fields hold: shape over time, largest change in rad, its deviation."""
-    ends = zip(fields, (field.knots[0][-1] for field in fields), strict=True)
-    x, y, z = (np.array(field.values).reshape(len(field.knots[0]), -1, 3)[-1] / reach for field, reach in ends)
-    angle = 0.5 * np.stack([y[:, 2] - z[:, 1], z[:, 0] - x[:, 2], x[:, 1] - y[:, 0]], axis=-1)
-    apart = np.linalg.norm(angle[:, None] - angle[None, :], axis=-1)
+
+    def components(tables: Sequence[tuple[tuple[float, ...], ...]]) -> Array:
+        """(times, 3) from the fields' values, or deviations, at the highest rate of each axis."""
+        ends = zip(tables, fields, strict=True)
+        x, y, z = (np.array(table).reshape(2, -1, 3)[-1] / field.knots[0][-1] for table, field in ends)
+        return np.stack([y[:, 2], z[:, 0], x[:, 1]], axis=-1)
+
+    angle = components([field.values for field in fields])
+    apart = angle[:, None] - angle[None, :]
+    size = np.linalg.norm(apart, axis=-1)
+    first, last = np.unravel_index(np.argmax(size), size.shape)
     axis = int(np.argmax(np.ptp(angle, axis=0)))
     along = np.linspace(fields[0].knots[1][0], fields[0].knots[1][-1], SAMPLES)
     curve = interpolated(fields[0].knots[1], angle, along)[:, axis]
     std = None
     if fields[0].std:
-        rows = [np.array(f.std).reshape(len(f.knots[0]), -1, 3)[-1] / f.knots[0][-1] for f in fields]
-        std = float(np.linalg.norm(np.median(rows, axis=1)))
+        deviation = components([field.std for field in fields])
+        way = apart[first, last] / max(float(size[first, last]), 1e-12)
+        std = float(np.linalg.norm(way * np.hypot(deviation[first], deviation[last])))
     shape = "a step" if fields[0].knots[1][-1] - fields[0].knots[1][0] < 2 * STEP_EDGE_S else curve_shape(curve, "time")
-    return shape, float(apart.max()), std
+    return shape, float(size[first, last]), std
 
 
 def _unit(kind: str, covariates: tuple[str, ...]) -> str:
