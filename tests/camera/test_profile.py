@@ -56,6 +56,7 @@ extensions:                                  # what a diagnosis added; an absent
   stabilisation: {fraction: 0.0, cutoff_hz: 1.0}
   frame_lag: {lag_s: 0.0, frames: 0}
   exposures_late_frames: 0
+  exposure_gain: []
   response_gamma: 1.0
   black_level: 0.0
   vignetting: {corner_loss: 0.0}
@@ -89,7 +90,19 @@ FULL = CameraProfile(
         "readout_direction": Estimate("bottom_to_top", None, "likelihood"),
     },
     extensions=Extensions(
-        0.01, 0.6, 2.5, 0.3, 17, 0.35, 0.1, 120.0, 0.7, (1.0, 0.97, 1.02), 0.8, exposures_late_frames=2
+        0.01,
+        0.6,
+        2.5,
+        0.3,
+        17,
+        0.35,
+        0.1,
+        120.0,
+        0.7,
+        (1.0, 0.97, 1.02),
+        0.8,
+        exposures_late_frames=2,
+        exposure_gain=(1.4, 0.6, 1.4),
     ),  # fmt: skip,
 )
 

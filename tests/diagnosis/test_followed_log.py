@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from diagnosis.test_photometry import FRAMES, NOMINAL, dimmed, hidden, made_observations
+from motion.synthetic_tracks import Recording, Setup
 from numpy.typing import NDArray
 
 from virest.camera.field import Field
@@ -23,13 +26,26 @@ from virest.diagnosis.findings import (
     Finding,
     HeldOutGain,
     Nominal,
+    ParameterChange,
     Remaining,
 )
-from virest.diagnosis.followed_log import rows_late, with_followed_log, with_late_exposures, with_own_exposures_told
+from virest.diagnosis.followed_log import (
+    OwnExposures,
+    exposures_of_light,
+    rows_late,
+    with_followed_log,
+    with_late_exposures,
+    with_own_exposures_told,
+)
+from virest.diagnosis.geometric_evidence import Model, make_evidence
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.picture_ladder import PictureVerdict, climb_observations
+from virest.inference.even_light import LevelChange
 
 Array = NDArray[np.float64]
+ALTERNATING = Setup(seed=71, frames=45, points=40, exposure_s=0.01, exposure_swing=0.4, rate_rad_s=0.8)
+"""Exposures that change by 40 %, and their log has one value."""
 STEPS = 0.5 * np.sin(0.4 * (np.arange(FRAMES) // 6 * 6) + 0.3)
 """Log exposure × ISO of the frames, which changes every sixth frame."""
 
@@ -156,7 +172,7 @@ def test_an_exposure_table_that_explains_as_much_as_a_delay_of_each_frame_is_the
     gain = HeldOutGain(GEOMETRY, 1.0, 0.31, 0.3)
     late = FieldFinding(("time",), "delay", "jitter", "late", 0.002, "s", None, gain, 1e-9, (), 1.0, "", "")
     found, given = _judged(1.1, 0.3, fields=(late,)), _judged(left_px, noise_px, unexplained=unexplained)
-    told = with_own_exposures_told(found, given, -1)
+    told = with_own_exposures_told(found, given, OwnExposures(-1))
     if not better:
         assert told is found
         return
@@ -166,3 +182,40 @@ def test_an_exposure_table_that_explains_as_much_as_a_delay_of_each_frame_is_the
     assert table.held_out.gain == pytest.approx(1 - (left_px**2 - noise_px**2) / (1 - noise_px**2))
     assert told.nominal is found.nominal
     assert (told.residuals["before"], told.residuals["after"]) == ({"x_px": 1.1}, {"x_px": left_px})
+
+
+def _unlogged(seed: int, gain: np.ndarray, missing: tuple[int, ...] = ()) -> OwnExposures | None:
+    """Exposures that a recording's points confirm; the log has one value.
+
+    gain: (frames,) of the light, without a value for the frames in ``missing``.
+    """
+    camera = Recording(replace(ALTERNATING, seed=seed))
+    observed = replace(camera.observed, exposure_s=np.full(len(camera.stamp_s), ALTERNATING.exposure_s))
+    pairs = tuple(replace(p, levels=LevelChange(gain[p.second] / gain[p.first])) for p in observed.pairs)
+    evidence = make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), replace(observed, pairs=pairs))
+    model = Model(camera.profile.with_curve(kind="linear"), None, ())
+    std = [np.nan if k in missing else 0.01 for k in range(len(gain))]
+    told = [1.0 if k in missing else g for k, g in enumerate(gain.tolist())]
+    change = ParameterChange([1.0] * len(gain), told, std)
+    drift = Finding("gain_drift", {"gain": change}, HeldOutGain("photometric_rms", 9.0, 1.0, 1.0), (), 0.0, "")
+    verdict = SimpleNamespace(evidence=evidence, nominal=model, model=model)
+    return exposures_of_light(cast(GeometricVerdict, verdict), drift)
+
+
+@pytest.mark.parametrize("missing", [(), (5, 6, 20)])
+def test_exposures_that_change_unlogged_are_told_from_a_gain(missing: tuple[int, ...]) -> None:
+    """Their scale comes from the points; frames whose brightness was not measured take it from their neighbour's."""
+    camera = Recording(ALTERNATING)
+    true = camera.exposure_s / ALTERNATING.exposure_s
+    found = _unlogged(ALTERNATING.seed, 1.7 * true, missing)
+    assert found is not None
+    assert found.p_value is not None
+    assert found.p_value < 1e-3
+    np.testing.assert_allclose(found.gain, true, rtol=0.06)
+
+
+def test_light_that_changes_is_no_exposure() -> None:
+    """Gains that the exposures do not share, in none of six seeds."""
+    rng = np.random.default_rng(5)
+    for seed in range(71, 77):
+        assert _unlogged(seed, np.exp(rng.normal(0, 0.2, ALTERNATING.frames))) is None

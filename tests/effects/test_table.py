@@ -81,6 +81,7 @@ OTHER_EXTENSION: dict[str, Any] = {
     "frame_lag_s": 0.1,
     "frame_lag_frames": 3,
     "exposures_late_frames": 2,
+    "exposure_gain": (1.0, 0.6),
     "vignetting_corner_loss": 0.3,
     "flicker_amplitude": 0.5,
     "flicker_frequency_hz": 120.0,

@@ -333,6 +333,7 @@ def _for_frames(
         frame_lag_s=0.0,
         frame_lag_frames=0,
         exposures_late_frames=0,
+        exposure_gain=(),
         gain=tuple(ext.gain[frame.index] for frame in frames) if ext.gain else (),
         flicker_amplitude=ext.flicker_amplitude if whole else 0.0,
         defocus_sigma_px=ext.defocus_sigma_px if whole else 0.0,

@@ -62,6 +62,8 @@ class Extensions:
     """xy, xz, yz: part of an axis's rate that the other axis of the pair reads too; 0 where they are perpendicular."""
     exposures_late_frames: int = 0
     """Rows by which exposure times and ISO values are logged late: frame k's are in row k + this many."""
+    exposure_gain: tuple[float, ...] = ()
+    """Factors on the logged exposure times of frames, by movie index; 1 where the list has none."""
     stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
     """θ about x and y at the start of the inertial log; fitted but not stored in files: its effect decays soon."""
     field: tuple[ModelField, ...] = ()
@@ -69,7 +71,16 @@ class Extensions:
 
     def gain_of(self, frames: ArrayLike) -> Array:
         """Factors on the light of frames, by movie index; 1 where the list has none."""
-        return np.append(self.gain, 1.0)[np.minimum(frames, len(self.gain))]
+        return _by_frame(self.gain, frames)
+
+    def exposure_gain_of(self, frames: ArrayLike) -> Array:
+        """Factors on the logged exposure times of frames, by movie index."""
+        return _by_frame(self.exposure_gain, frames)
+
+
+def _by_frame(values: tuple[float, ...], frames: ArrayLike) -> Array:
+    """Values of frames, by movie index; 1 beyond the list."""
+    return np.append(values, 1.0)[np.minimum(frames, len(values))]
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,6 +88,7 @@ def _from_model(model: ProfileFile) -> CameraProfile:
             frame_lag_s=extensions.frame_lag.lag_s,
             frame_lag_frames=extensions.frame_lag.frames,
             exposures_late_frames=extensions.exposures_late_frames,
+            exposure_gain=tuple(extensions.exposure_gain),
             vignetting_corner_loss=extensions.vignetting.corner_loss,
             flicker_amplitude=extensions.flicker.amplitude,
             flicker_frequency_hz=extensions.flicker.frequency_hz,
@@ -217,6 +218,8 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         extensions["frame_lag"] = {"lag_s": ext.frame_lag_s, "frames": ext.frame_lag_frames}
     if ext.exposures_late_frames:
         extensions["exposures_late_frames"] = ext.exposures_late_frames
+    if ext.exposure_gain:
+        extensions["exposure_gain"] = list(ext.exposure_gain)
     if profile.response and profile.response.extra_gamma != 1.0:
         extensions["response_gamma"] = profile.response.extra_gamma
     if profile.response and profile.response.black_level:

@@ -184,6 +184,7 @@ class ExtensionsBlock(_Strict):
     stabilisation: _Stabilisation = _Stabilisation()
     frame_lag: _FrameLag = _FrameLag()
     exposures_late_frames: Annotated[int, Field(ge=-10, le=10)] = 0
+    exposure_gain: list[Positive] = []
     response_gamma: Positive = 1.0
     black_level: Annotated[Number, Field(ge=0, lt=0.9)] = 0.0
     vignetting: _Vignetting = _Vignetting()

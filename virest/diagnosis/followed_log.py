@@ -18,8 +18,10 @@ from scipy.linalg import null_space
 from virest.arrays import Array, Index
 from virest.camera.field import cardinal_weights
 from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.records import Frame
+from virest.diagnosis.cross_validation import JUDGE_POINTS
 from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION
 from virest.diagnosis.field.words import SAMPLES, curve_shape
@@ -31,20 +33,30 @@ from virest.diagnosis.findings import (
     FieldFinding,
     Finding,
     HeldOutGain,
+    ParameterChange,
     Rival,
 )
+from virest.diagnosis.geometric_evidence import Evidence, Model
+from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import FollowedGain
 from virest.diagnosis.photometry_fit import fit_photometry, judge
 from virest.diagnosis.picture_ladder import PictureVerdict
+from virest.diagnosis.selection import WORD_LEVELS
 from virest.image_formation.row_clock import RowClock
+from virest.inference.chance import chance_of
+from virest.inference.hold_out import group_means, loss
 from virest.inference.parallel import ParallelMap, one_by_one
+from virest.inference.profile_terms import TERMS
+from virest.inference.tracking import TrackPair
 from virest.restoration.frame_time_plan import ROWS_LATE, rows_apart
 
 KNOTS = 5
 """Most knots of a curve over a logged quantity: a cubic spline through 5 follows one period to 10 % (rms)."""
 TABLE = "exposure_rows"
 """Kind of the finding for an exposure table that is some rows off; ``extensions.exposures_late_frames`` holds it."""
+UNLOGGED = "exposure_gain"
+"""Kind of the finding for exposure times that change unlogged; ``extensions.exposure_gain`` holds them."""
 LEAST_FRAMES = 3
 """Least frames whose delays are compared with exposures: an offset and a factor are fitted to them."""
 FROM_ONE = 0.25
@@ -79,6 +91,24 @@ class Form:
         if self.frames_off:
             return f"exposure and ISO logged {rows_apart(self.frames_off)}"
         return f"gain over {LOGGED[self.name]}"
+
+
+@dataclass(frozen=True, slots=True)
+class OwnExposures:
+    """The frames' own exposures: those of other rows of the table, or the logged ones times a factor each."""
+
+    rows_late: int = 0
+    gain: tuple[float, ...] = ()
+    p_value: float | None = None
+    """Probability of points that agree so much better with them; None: that of the delay that they explain."""
+
+    def on(self, profile: CameraProfile) -> CameraProfile:
+        """A profile that gives the frames these exposures."""
+        ext = profile.extensions
+        rows, gain = ext.exposures_late_frames + self.rows_late, ext.exposure_gain
+        if self.gain:
+            gain = tuple((ext.exposure_gain_of(range(len(self.gain))) * np.array(self.gain)).tolist())
+        return profile.with_extensions(exposures_late_frames=rows, exposure_gain=gain)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,27 +157,97 @@ def with_late_exposures(finding: FieldFinding, rows: int) -> FieldFinding:
     return replace(finding, confounded=(*finding.confounded, rival), sentence=sentence)
 
 
-def with_own_exposures_told(found: Diagnosis, given: Diagnosis, rows: int) -> Diagnosis:
-    """One of two diagnoses: of the capture as logged, and with each frame's own exposure, from ``rows`` away.
+def exposures_of_light(geometric: GeometricVerdict, drift: Finding) -> OwnExposures | None:
+    """Exposures that change as the brightness does, if the points agree better with them than with the logged ones.
 
-    A table that is off has no free number besides its rows.  It is the better account of a delay of each frame if it
-    removes as much as a rival of the delay must, and nothing is left in the points that was not before.
+    drift: gains of the frames' light, up to a factor.  A frame whose exposure time changes unlogged is brighter or
+    darker, and its points are seen earlier or later, by half of the change where stamps mark its start.  Points are
+    compared with the model at the ladder's end, and with the given one and its clocks, since a cause may have taken the
+    delays' place.
     """
-    delay = next(field for field in found.fields if (field.kind, field.covariates) == ("delay", (TIME,)))
-    gain = replace(delay.held_out, after=_points_left_px(given), noise=given.nominal.geometry_noise_px)
-    if (gain.gain or 0.0) < RIVAL_GAIN_FRACTION * (delay.held_out.gain or 0.0):
+    evidence = geometric.evidence
+    if evidence is None or not evidence.observed.exposure_known:
+        return None
+    gain = _completed(drift.parameters["gain"], evidence.observed.pairs, geometric.model.profile.curve)
+    models = _with_terms(geometric.nominal, "time_offset", "clock_skew"), geometric.model
+    found = [_compared_exposures(evidence, _with_terms(model, "exposure_time"), gain) for model in models]
+    best = min(found, key=lambda own: own.p_value or 0.0)
+    p_value = len(models) * (best.p_value or 0.0)
+    return replace(best, p_value=p_value) if WORD_LEVELS.significant(p_value) else None
+
+
+def _completed(gain: ParameterChange, pairs: Sequence[TrackPair], curve: ResponseCurve) -> Array:
+    """Gains (frames,) over the given ones; without patches, a frame's follows from the next and the points' light."""
+    log_gain = np.log(np.array(gain.estimate, float) / np.array(gain.nominal, float))
+    known = np.isfinite(np.array(gain.std, float))
+    steps = [(pair.first, pair.second, pair.levels.log_light(curve)) for pair in pairs]
+    for start, end, step in [*steps, *((second, first, -step) for first, second, step in reversed(steps))]:
+        if known[start] and not known[end]:
+            log_gain[end], known[end] = log_gain[start] + step, True
+    return np.exp(log_gain)
+
+
+def _with_terms(model: Model, *names: str) -> Model:
+    """A model that is fitted with further causes."""
+    known = {term.name for term in model.terms}
+    return replace(model, terms=(*model.terms, *(TERMS[name] for name in names if name not in known)))
+
+
+def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> OwnExposures:
+    """Exposures that change as ``gain`` does, with the scale that fits best and the p value of a smaller loss.
+
+    The loss is compared in each time block with that of the logged exposures; their scale is fitted too.
+    """
+    logged, gain = evidence.table(model, JUDGE_POINTS), gain / gain.mean()
+    own = replace(
+        logged,
+        first_exposure_s=logged.first_exposure_s * gain[logged.first],
+        second_exposure_s=logged.second_exposure_s * gain[logged.second],
+    )
+    fits = [evidence.fit(model, model.terms, table) for table in (logged, own)]
+    scale = min(fit.scale for fit in fits)
+    before, after = (group_means(loss(fit.distance, scale), evidence.block[logged.pair]) for fit in fits)
+    longer = fits[1].profile.shutter.exposure_scale / model.profile.shutter.exposure_scale
+    return OwnExposures(gain=tuple((longer * gain).tolist()), p_value=chance_of(before - after))
+
+
+def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposures) -> Diagnosis:
+    """One of two diagnoses: of the capture as logged, and with each frame's own exposure.
+
+    A table that is off has no free number besides its rows, and exposures that follow the light have none.  They are
+    the better account if they remove as much as a rival of a delay of each frame must, and nothing is left in the
+    points, and no gain of the light, that was not before.
+    """
+    over_time = (field for field in found.fields if (field.kind, field.covariates) == ("delay", (TIME,)))
+    delay = next(over_time, None)
+    nominal = found.nominal
+    held_out = HeldOutGain(GEOMETRY, nominal.geometry_rms_px, _points_left_px(found), nominal.geometry_noise_px)
+    held_out = held_out if delay is None else delay.held_out
+    gain = replace(held_out, after=_points_left_px(given), noise=given.nominal.geometry_noise_px)
+    if (gain.gain or 0.0) < RIVAL_GAIN_FRACTION * (held_out.gain or 0.0):
         return found
     if given.unexplained.significant and not found.unexplained.significant:
         return found
-    sentence = (
-        f"exposure times and ISO values are logged {rows_apart(rows)} (points {gain.before:.3f} px → {gain.after:.3f} "
-        "px): with its own, each frame is where the points are"
-    )
-    told = FieldFinding(
-        ("exposure",), TABLE, rows_apart(rows), sentence, float(rows), "frames", None, gain, delay.p_value, (), None,
-        "a recorder that joins two queues, or an encoder that drops its first frames",
-        "film a lamp that is switched on, and compare the row of the jump with the frame of the jump",
-    )  # fmt: skip
+    if own.gain and any(cause.name == "gain_drift" for cause in given.causes):
+        return found
+    points = f"(points {gain.before:.3f} px → {gain.after:.3f} px): with its own, each frame is where the points are"
+    if own.gain:
+        size = max(own.gain, key=lambda g: abs(g - 1)) - 1
+        told = FieldFinding(
+            ("exposure",), UNLOGGED, "as the brightness",
+            f"exposure times change as the brightness does, up to {size:+.0%} of those logged {points}",
+            size, "1", None, gain, own.p_value, (), None,
+            "a sensor that alternates exposures (HDR), or a log of the exposures that were asked for",
+            "film an LED display that counts milliseconds, and compare the counts in a frame with its exposure time",
+        )  # fmt: skip
+    else:
+        apart = rows_apart(own.rows_late)
+        told = FieldFinding(
+            ("exposure",), TABLE, apart, f"exposure times and ISO values are logged {apart} {points}",
+            float(own.rows_late), "frames", None, gain, None if delay is None else delay.p_value, (), None,
+            "a recorder that joins two queues, or an encoder that drops its first frames",
+            "film a lamp that is switched on, and compare the row of the jump with the frame of the jump",
+        )  # fmt: skip
     verdict = UNEXPLAINED if given.unexplained.significant else EXPLAINED
     return replace(
         given,

@@ -45,7 +45,14 @@ from virest.diagnosis.findings import (
     Nominal,
     Rival,
 )
-from virest.diagnosis.followed_log import rows_late, with_followed_log, with_late_exposures, with_own_exposures_told
+from virest.diagnosis.followed_log import (
+    OwnExposures,
+    exposures_of_light,
+    rows_late,
+    with_followed_log,
+    with_late_exposures,
+    with_own_exposures_told,
+)
 from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
@@ -100,16 +107,15 @@ def diagnose_capture(
     report = progress or (lambda _text, _part: None)
     session = _climbed(capture, profile, pictures, gray, report, each, frozenset(kept_back))
     found = session.conclude()
-    if not session.exposures_late_frames:
+    own = session.own_exposures(found)
+    if own is None:
         return found
-    further = profile.extensions.exposures_late_frames + session.exposures_late_frames
-    own = profile.with_extensions(exposures_late_frames=further)
 
     def again(text: str, part: float) -> None:
-        report(f"{text}, with the exposures of other rows", part)
+        report(f"{text}, with the frames' own exposures", part)
 
-    corrected = _climbed(capture, own, pictures, gray, again, each, frozenset(kept_back)).conclude()
-    return with_own_exposures_told(found, corrected, session.exposures_late_frames)
+    corrected = _climbed(capture, own.on(profile), pictures, gray, again, each, frozenset(kept_back)).conclude()
+    return with_own_exposures_told(found, corrected, own)
 
 
 def _climbed(
@@ -376,6 +382,13 @@ class DiagnosisSession:
         rows = rows_late(told, self.capture.frames, self.geometric.model.profile)
         self.exposures_late_frames = self.exposures_late_frames or rows
         return with_late_exposures(told, rows)
+
+    def own_exposures(self, found: Diagnosis) -> OwnExposures | None:
+        """Exposures that explain delays or gains of frames which a diagnosis found; None: those logged."""
+        if self.exposures_late_frames:
+            return OwnExposures(self.exposures_late_frames)
+        drift = next((cause for cause in found.causes if cause.name == "gain_drift"), None)
+        return None if drift is None else exposures_of_light(self.geometric, drift)
 
     def conclude(self) -> Diagnosis:
         """The diagnosis, assembled from all stages."""

@@ -172,8 +172,8 @@ def at_model_times(capture: Capture, geometric: GeometricVerdict) -> list[Frame]
 
 
 def lighting_changes(profile: CameraProfile) -> bool:
-    """Whether the light changes between frames, which biases tracked points."""
-    return bool(profile.extensions.flicker_amplitude or profile.extensions.gain)
+    """Whether light changes within frames, which biases tracked points; the tracker evens changes of whole frames."""
+    return bool(profile.extensions.flicker_amplitude)
 
 
 def _under(found: GeometricVerdict, lit: CameraProfile) -> GeometricVerdict:
@@ -191,7 +191,7 @@ def with_flicker_of(profile: CameraProfile, lit: CameraProfile) -> CameraProfile
 
 
 def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: CameraProfile) -> Reader:
-    """The same pictures without flicker and gain changes, for tracking."""
+    """The same pictures without flicker, for tracking."""
     by_index = {frame.index: frame for frame in frames}
     curve = profile.curve
     height, width, shutter, clock = profile.height, profile.width, profile.shutter, RowClock(profile)
@@ -207,7 +207,7 @@ def without_lighting_changes(gray: Reader, frames: Sequence[Frame], profile: Cam
             logged_s = frame.exposure_s or 0.0
             middle_s = clock.seen_s(rows_px, frame.time_s, logged_s)
             light = flicker(profile, middle_s, shutter.true_exposure_s(logged_s))
-            linear = curve.linear_table()[picture] / (light * profile.extensions.gain_of(index))
+            linear = curve.linear_table()[picture] / light
             yield index, np.clip(np.rint(255 * curve.encode(linear)), 0, 255).astype(np.uint8)
 
     return corrected

@@ -38,7 +38,8 @@ OF_PROFILE = {
 OF_EXTENSIONS = {
     **dict.fromkeys(("focal_drift_per_s", "stabilisation_fraction", "stabilisation_cutoff_hz"), LENS),
     "stabilisation_lean_rad": LENS,
-    **dict.fromkeys(("frame_lag_s", "frame_lag_frames", "exposures_late_frames"), NOTHING),
+    **dict.fromkeys(("frame_lag_s", "frame_lag_frames"), NOTHING),
+    **dict.fromkeys(("exposures_late_frames", "exposure_gain"), NOTHING),
     **dict.fromkeys(("vignetting_corner_loss", "gain", "defocus_sigma_px"), NOTHING),
     **dict.fromkeys(("flicker_amplitude", "flicker_frequency_hz", "flicker_phase_rad"), NOTHING),
 }

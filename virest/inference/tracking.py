@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from virest.arrays import Array, Index, Mask, Picture
+from virest.inference.even_light import SAME_LEVELS, LevelChange, level_change
 from virest.inference.parallel import ParallelMap, one_by_one
 
 Points = NDArray[np.float32]
@@ -28,6 +29,8 @@ CORNER_BLOCK_PX = 5
 and 7434 tracks with a noise of 0.121, 0.123 and 0.116 px."""
 CORNER_SPACING_PX = 7
 """A corner is the strongest in a square of this side."""
+LIGHT_ROUNDS = 3
+"""Matches of a pair at most, each with the brightness change that the last one shows."""
 OUTSIDE_PX = 1e6
 """Finite bound outside any picture for positions where the lens model diverges."""
 REPEATS = 1.9
@@ -92,6 +95,8 @@ class TrackPair:
     """(n, 2), the same points."""
     guided: bool = False
     """Whether a guide warped the first picture and made both pictures equally blurred before matching."""
+    levels: LevelChange = SAME_LEVELS
+    """Grey levels of the second frame over those of the first."""
 
     def __len__(self) -> int:
         return len(self.points_first_px)
@@ -228,12 +233,24 @@ def _track(
     if len(start) == 0:
         return TrackPair(index, index + 1, np.zeros((0, 2)), np.zeros((0, 2)))
     between = None if guide is None else guide.seen_before(index, index + 1, first.shape, factor)
-    if between is None:
-        ahead, good = _there_and_back(first, second, start, settings, settings.pyramid_levels)
-    else:
-        ahead, good = _guided(first, second, start, settings, between)
+    light = SAME_LEVELS
+    for _ in range(LIGHT_ROUNDS):
+        ahead, good = _matched(*light.evened(first, second), start, settings, between)
+        found = level_change(first, second, start[good], ahead[good])
+        if found.is_near(light, first):
+            break
+        light = found
     points_px = _stored(start[good], factor), _stored(ahead[good], factor)
-    return TrackPair(index, index + 1, *points_px, guided=between is not None)
+    return TrackPair(index, index + 1, *points_px, between is not None, found)
+
+
+def _matched(
+    first: Picture, second: Picture, start: Points, settings: TrackingSettings, between: Between | None
+) -> tuple[Points, Mask]:
+    """Found positions (n, 2) of points, and the mask (n,) of reliable ones."""
+    if between is None:
+        return _there_and_back(first, second, start, settings, settings.pyramid_levels)
+    return _guided(first, second, start, settings, between)
 
 
 def _guided(

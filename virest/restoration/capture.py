@@ -245,7 +245,7 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     the movie ends before the lag reaches 0: then the observed ones are used, and all slots keep the remaining lag.
     Frames that were skipped only for the start-up become usable.  Exposures logged in other rows are given back.
     """
-    frames = with_own_exposures(frames, profile.extensions.exposures_late_frames)
+    frames = with_own_exposures(frames, profile.extensions.exposures_late_frames, profile.extensions.exposure_gain)
     lagging = profile.extensions.frame_lag_frames
     period_s = median_period_s(np.array([frame.time_s for frame in frames]))
     periods = profile.extensions.frame_lag_s / period_s if period_s > 0 else 0.0
@@ -264,11 +264,19 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     return (*early, *frames[last + 1 :])
 
 
-def with_own_exposures(frames: Sequence[Frame], rows_late: int) -> tuple[Frame, ...]:
+def with_own_exposures(
+    frames: Sequence[Frame], rows_late: int, exposure_gain: Sequence[float] = ()
+) -> tuple[Frame, ...]:
     """The frames with the exposure times and ISO values logged for the frames ``rows_late`` later; the last ones stay.
 
-    Those before the first or after the last row keep the nearest one.
+    Those before the first or after the last row keep the nearest one.  exposure_gain: factors on the exposure times.
     """
+    if exposure_gain:
+        gains = (*exposure_gain, *[1.0] * len(frames))
+        others = with_own_exposures(frames, rows_late)
+        return tuple(
+            replace(f, exposure_s=f.exposure_s and f.exposure_s * gain) for f, gain in zip(others, gains, strict=False)
+        )
     if not rows_late:
         return tuple(frames)
     sources = np.clip(np.arange(len(frames)) + rows_late, 0, len(frames) - 1)

@@ -55,7 +55,7 @@ from virest.restoration.conflict_plan import (
     explains_points,
     settle,
 )
-from virest.restoration.frame_time_plan import find_frame_times, for_late_exposures
+from virest.restoration.frame_time_plan import find_frame_times, for_own_exposures
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbour_plan import with_neighbour_survey
 from virest.restoration.neighbours.survey import store_lumas, survey_runs
@@ -87,10 +87,11 @@ def plan_restoration(
     coding: how frames were coded, by frame index, filled in as frames are read; missing: unknown.
     """
     coding = {} if coding is None else coding
-    if rows := profile.extensions.exposures_late_frames:
-        capture = replace(capture, frames=with_own_exposures(capture.frames, rows))
-        even = profile.with_extensions(exposures_late_frames=0)
-        return for_late_exposures(plan_restoration(capture, even, settings, read_gray, coding), rows)
+    rows, gain = profile.extensions.exposures_late_frames, profile.extensions.exposure_gain
+    if rows or gain:
+        capture = replace(capture, frames=with_own_exposures(capture.frames, rows, gain))
+        even = profile.with_extensions(exposures_late_frames=0, exposure_gain=())
+        return for_own_exposures(plan_restoration(capture, even, settings, read_gray, coding), rows, gain)
     lag = None if settings.keep_start_up else find_lag(capture, profile, read_gray)
     if lag is None:
         return _planned(capture, profile, settings, read_gray, coding)

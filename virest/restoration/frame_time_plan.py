@@ -62,14 +62,16 @@ class FrameTimes:
 
     def noted(self, plan: RestorationPlan) -> RestorationPlan:
         """The plan that was made with these times, for the capture as it was read."""
-        return for_late_exposures(plan, self.rows_late).noted(NoteCode.TRUE_TIMES, self.text)
+        return for_own_exposures(plan, self.rows_late).noted(NoteCode.TRUE_TIMES, self.text)
 
 
-def for_late_exposures(plan: RestorationPlan, rows_late: int) -> RestorationPlan:
-    """A plan that was made with the frames' own exposures, for a capture whose rows of them are late."""
+def for_own_exposures(plan: RestorationPlan, rows_late: int, exposure_gain: tuple[float, ...] = ()) -> RestorationPlan:
+    """A plan that was made with the frames' own exposures, for a capture whose table of them is off."""
 
     def changed(profile: CameraProfile) -> CameraProfile:
-        return profile.with_extensions(exposures_late_frames=profile.extensions.exposures_late_frames + rows_late)
+        ext = profile.extensions
+        rows = ext.exposures_late_frames + rows_late
+        return profile.with_extensions(exposures_late_frames=rows, exposure_gain=exposure_gain or ext.exposure_gain)
 
     contradicted = None if plan.contradicted is None else changed(plan.contradicted)
     return replace(plan, profile=changed(plan.profile), contradicted=contradicted)

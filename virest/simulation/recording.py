@@ -296,6 +296,8 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
     for k, stamp in enumerate(session.stamp_ns.tolist()):
         own = min(max(k - late, 0), last)
         exposure, iso = session.logged_exposure_s(own), int(session.exposures.iso[own])
+        for log in (nominal.extensions, session.hidden):
+            exposure /= float(log.exposure_gain[own]) if own < len(log.exposure_gain) else 1.0
         numbers = [
             _logged_ns(stamp, options),
             fx,

@@ -112,7 +112,12 @@ def from_frame(profile: CameraProfile, frames: Sequence[Frame]) -> CameraProfile
     lag_s, lag_frames = _lag_left(extensions, index[0])
     gain = tuple(extensions.gain_of(index).tolist()) if extensions.gain else ()
     extensions = dataclasses.replace(
-        extensions, gain=gain, frame_lag_s=lag_s, frame_lag_frames=lag_frames, exposures_late_frames=0
+        extensions,
+        gain=gain,
+        frame_lag_s=lag_s,
+        frame_lag_frames=lag_frames,
+        exposures_late_frames=0,
+        exposure_gain=(),
     )
     return dataclasses.replace(
         changed, time_offset_s=changed.time_offset_s or 0.0, depth_m=np.inf, extensions=extensions
