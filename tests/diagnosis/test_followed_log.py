@@ -31,7 +31,7 @@ from virest.diagnosis.findings import (
 )
 from virest.diagnosis.followed_log import (
     OwnExposures,
-    exposures_of_light,
+    exposures_of_points,
     rows_late,
     with_followed_log,
     with_late_exposures,
@@ -199,7 +199,7 @@ def _unlogged(seed: int, gain: np.ndarray, missing: tuple[int, ...] = ()) -> Own
     change = ParameterChange([1.0] * len(gain), told, std)
     drift = Finding("gain_drift", {"gain": change}, HeldOutGain("photometric_rms", 9.0, 1.0, 1.0), (), 0.0, "")
     verdict = SimpleNamespace(evidence=evidence, nominal=model, model=model)
-    return exposures_of_light(cast(GeometricVerdict, verdict), drift)
+    return exposures_of_points(cast(GeometricVerdict, verdict), [], drift, delays=False)
 
 
 @pytest.mark.parametrize("missing", [(), (5, 6, 20)])

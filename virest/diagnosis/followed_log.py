@@ -21,6 +21,7 @@ from virest.camera.profile import CameraProfile
 from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.records import Frame
+from virest.diagnosis.candidates import varies
 from virest.diagnosis.cross_validation import JUDGE_POINTS
 from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION
@@ -62,6 +63,8 @@ LEAST_FRAMES = 3
 FROM_ONE = 0.25
 """Largest difference from 1 of the factor by which gains follow another frame's exposure × ISO: half way to the factor
 of an encoder that is late by half a frame (DELAY_FRAMES)."""
+DELAYED_P = 0.01
+"""p value of exposures of other rows from which the capture is diagnosed with them; what they leave decides."""
 FOLLOWED = ("gain_drift", "response_curve", "black_level")
 """Causes that brightness shows where exposure × ISO varies."""
 NEXT = {
@@ -157,34 +160,40 @@ def with_late_exposures(finding: FieldFinding, rows: int) -> FieldFinding:
     return replace(finding, confounded=(*finding.confounded, rival), sentence=sentence)
 
 
-def exposures_of_light(geometric: GeometricVerdict, drift: Finding) -> OwnExposures | None:
-    """Exposures that change as the brightness does, if the points agree better with them than with the logged ones.
+def exposures_of_points(
+    geometric: GeometricVerdict, frames: Sequence[Frame], drift: Finding | None, delays: bool
+) -> OwnExposures | None:
+    """Exposures with which the points agree better than with the logged ones: of other rows, or as brightness changes.
 
-    drift: gains of the frames' light, up to a factor.  A frame whose exposure time changes unlogged is brighter or
-    darker, and its points are seen earlier or later, by half of the change where stamps mark its start.  Points are
-    compared with the model at the ladder's end, and with the given one and its clocks, since a cause may have taken the
-    delays' place.
+    frames: all of the movie, by index.  drift: gains of the frames' light, up to a factor.  delays: whether frames are
+    late by times of their own, which rows of a table may explain.
+
+    A frame whose exposure time changes unlogged is brighter or darker, and its points are seen earlier or later, by
+    half of the change where stamps mark its start.  Points are compared with the model at the ladder's end, and with
+    the given one and its clocks, since a cause may have taken the delays' place.
     """
     evidence = geometric.evidence
     if evidence is None or not evidence.observed.exposure_known:
         return None
-    gain = _completed(drift.parameters["gain"], evidence.observed.pairs, geometric.model.profile.curve)
+    tried: list[tuple[OwnExposures, Array]] = []
+    exposure_s = np.array([frame.exposure_s or np.nan for frame in frames])
+    if delays and np.isfinite(exposure_s).all() and varies(exposure_s):
+        moved = (np.clip(np.arange(len(frames)) + rows, 0, len(frames) - 1) for rows in ROWS_LATE)
+        tried += [(OwnExposures(n), exposure_s[m] / exposure_s) for n, m in zip(ROWS_LATE, moved, strict=True)]
+    if drift is not None:
+        gain = _completed(drift.parameters["gain"], evidence.observed.pairs, geometric.model.profile.curve)
+        tried.append((OwnExposures(), gain))
     models = _with_terms(geometric.nominal, "time_offset", "clock_skew"), geometric.model
-    found = [_compared_exposures(evidence, _with_terms(model, "exposure_time"), gain) for model in models]
-    best = min(found, key=lambda own: own.p_value or 0.0)
-    p_value = len(models) * (best.p_value or 0.0)
-    return replace(best, p_value=p_value) if WORD_LEVELS.significant(p_value) else None
-
-
-def _completed(gain: ParameterChange, pairs: Sequence[TrackPair], curve: ResponseCurve) -> Array:
-    """Gains (frames,) over the given ones; without patches, a frame's follows from the next and the points' light."""
-    log_gain = np.log(np.array(gain.estimate, float) / np.array(gain.nominal, float))
-    known = np.isfinite(np.array(gain.std, float))
-    steps = [(pair.first, pair.second, pair.levels.log_light(curve)) for pair in pairs]
-    for start, end, step in [*steps, *((second, first, -step) for first, second, step in reversed(steps))]:
-        if known[start] and not known[end]:
-            log_gain[end], known[end] = log_gain[start] + step, True
-    return np.exp(log_gain)
+    best, least = None, 1.0
+    for own, gain in tried:
+        for model in models:
+            scaled, p_value = _compared_exposures(evidence, _with_terms(model, "exposure_time"), gain)
+            if (p_value := len(tried) * len(models) * p_value) < least:
+                best, least = own if own.rows_late else OwnExposures(gain=scaled, p_value=p_value), p_value
+    if best is None:
+        return None
+    # rows are judged again by what they leave of the delays
+    return best if least < (DELAYED_P if best.rows_late else WORD_LEVELS.max_p) else None
 
 
 def _with_terms(model: Model, *names: str) -> Model:
@@ -193,8 +202,8 @@ def _with_terms(model: Model, *names: str) -> Model:
     return replace(model, terms=(*model.terms, *(TERMS[name] for name in names if name not in known)))
 
 
-def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> OwnExposures:
-    """Exposures that change as ``gain`` does, with the scale that fits best and the p value of a smaller loss.
+def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> tuple[tuple[float, ...], float]:
+    """(factors proportional to ``gain`` that fit best, p value of a smaller loss with them).
 
     The loss is compared in each time block with that of the logged exposures; their scale is fitted too.
     """
@@ -208,7 +217,18 @@ def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> OwnExp
     scale = min(fit.scale for fit in fits)
     before, after = (group_means(loss(fit.distance, scale), evidence.block[logged.pair]) for fit in fits)
     longer = fits[1].profile.shutter.exposure_scale / model.profile.shutter.exposure_scale
-    return OwnExposures(gain=tuple((longer * gain).tolist()), p_value=chance_of(before - after))
+    return tuple((longer * gain).tolist()), chance_of(before - after)
+
+
+def _completed(gain: ParameterChange, pairs: Sequence[TrackPair], curve: ResponseCurve) -> Array:
+    """Gains (frames,) over the given ones; without patches, a frame's follows from the next and the points' light."""
+    log_gain = np.log(np.array(gain.estimate, float) / np.array(gain.nominal, float))
+    known = np.isfinite(np.array(gain.std, float))
+    steps = [(pair.first, pair.second, pair.levels.log_light(curve)) for pair in pairs]
+    for start, end, step in [*steps, *((second, first, -step) for first, second, step in reversed(steps))]:
+        if known[start] and not known[end]:
+            log_gain[end], known[end] = log_gain[start] + step, True
+    return np.exp(log_gain)
 
 
 def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposures) -> Diagnosis:

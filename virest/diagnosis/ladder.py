@@ -33,6 +33,7 @@ from virest.diagnosis.field.brightness import (
     without_gain,
 )
 from virest.diagnosis.field.contradicted import known_stretches
+from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import (
@@ -47,7 +48,7 @@ from virest.diagnosis.findings import (
 )
 from virest.diagnosis.followed_log import (
     OwnExposures,
-    exposures_of_light,
+    exposures_of_points,
     rows_late,
     with_followed_log,
     with_late_exposures,
@@ -388,7 +389,8 @@ class DiagnosisSession:
         if self.exposures_late_frames:
             return OwnExposures(self.exposures_late_frames)
         drift = next((cause for cause in found.causes if cause.name == "gain_drift"), None)
-        return None if drift is None else exposures_of_light(self.geometric, drift)
+        late = any((field.kind, field.covariates) == ("delay", (TIME,)) for field in found.fields)
+        return exposures_of_points(self.geometric, self.capture.frames, drift, late) if late or drift else None
 
     def conclude(self) -> Diagnosis:
         """The diagnosis, assembled from all stages."""
