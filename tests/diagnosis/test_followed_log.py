@@ -219,3 +219,22 @@ def test_light_that_changes_is_no_exposure() -> None:
     rng = np.random.default_rng(5)
     for seed in range(71, 77):
         assert _unlogged(seed, np.exp(rng.normal(0, 0.2, ALTERNATING.frames))) is None
+
+
+def test_unlogged_exposures_are_the_finding_if_they_leave_no_gain() -> None:
+    """One account of delays and gains; a gain that remains shows another cause."""
+    drift = Finding("gain_drift", {}, HeldOutGain("photometric_rms", 9.0, 1.0, 1.0), (), 0.0, "")
+    found, given = replace(_judged(1.1, 0.3), causes=(drift,)), _judged(0.31, 0.3)
+    found = replace(found, fields=(FieldFinding(
+        ("time",), "delay", "jitter", "late", 0.002, "s", None, HeldOutGain(GEOMETRY, 1.0, 0.31, 0.3), 1e-9, (), 1.0,
+        "", ""),))  # fmt: skip
+    own = OwnExposures(gain=(0.6, 1.45, 0.6), p_value=1e-6)
+    told = with_own_exposures_told(found, given, own)
+    (table,) = told.fields
+    assert (table.kind, table.size, table.unit) == ("exposure_gain", pytest.approx(0.45), "1")
+    assert table.p_value == 1e-6
+    assert not told.causes
+    assert with_own_exposures_told(found, replace(given, causes=(drift,)), own) is found
+    profile = own.on(CameraProfile(640, 480).with_extensions(exposure_gain=(2.0,)))
+    assert profile.extensions.exposure_gain == pytest.approx((1.2, 1.45, 0.6))
+    assert OwnExposures(-1).on(profile).extensions.exposures_late_frames == -1

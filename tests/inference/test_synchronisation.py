@@ -383,14 +383,13 @@ def test_car_recording_gives_its_offset() -> None:
 
 
 def test_a_shaken_phone_gives_an_offset_of_nearly_half_a_second() -> None:
-    """nexus5_162941: the offset is found from zero, and its drift is reported."""
+    """nexus5_162941: the offset is found from zero, and its drift is estimated."""
     recorded = measured("nexus5_162941")
     found = estimate_time_offset(*recorded)
     assert found.determined, found.reason
     assert 0.39 < found.time_offset_s < 0.47
     assert abs(found.time_offset_s + 0.5 * recorded[2].shutter.readout_time_s - 0.461) < 0.006
     assert found.std_s > 0.005
-    assert "drifts" in found.reason
     assert found.drift_s_per_s > 0.001
     assert check_agreement(*recorded[:2], replace(recorded[2], time_offset_s=found.time_offset_s)).agrees
 

@@ -51,7 +51,8 @@ def said(plan: RestorationPlan) -> list[str]:
 
 def middles_s(capture: Capture, plan: RestorationPlan) -> np.ndarray:
     """Mid-exposure of the middle rows by a plan, IMU clock."""
-    frames = with_own_exposures(capture.frames, plan.profile.extensions.exposures_late_frames)
+    extensions = plan.profile.extensions
+    frames = with_own_exposures(capture.frames, extensions.exposures_late_frames, extensions.exposure_gain)
     stamp_s, exposure_s = (np.array([getattr(f, name) for f in frames]) for name in ("time_s", "exposure_s"))
     return np.asarray(RowClock(plan.profile).middle_s(stamp_s, exposure_s))
 
@@ -79,6 +80,17 @@ def test_frames_with_jittering_stamps_are_used_when_their_points_were_seen(captu
     assert field.stamp_0_ns == capture.stamp_0_ns
     late_s, std_s = np.array(field.values)[:, 0], np.array(field.std)[:, 0]
     assert np.mean(np.abs(late_s + jitter_s - np.mean(late_s + jitter_s)) < 2 * std_s) > 0.85
+
+
+def test_a_profile_gives_frames_the_exposures_that_the_log_lacks(capture: Capture) -> None:
+    """The log has one exposure for all frames; with the profile's factors the plan is that of the right log."""
+    own_s = np.array([frame.exposure_s for frame in capture.frames], float)
+    flat = replace(capture, frames=tuple(replace(frame, exposure_s=0.01) for frame in capture.frames))
+    gain = tuple((own_s / 0.01).tolist())
+    plan = planned(flat, resolve_profile(capture)[0].with_extensions(exposure_gain=gain))
+    assert not said(plan)
+    assert plan.profile.extensions.exposure_gain == gain
+    np.testing.assert_allclose(middles_s(flat, plan), middles_s(capture, planned(capture)), atol=1e-9)
 
 
 @pytest.mark.parametrize("rows", [2, -1])
@@ -125,6 +137,17 @@ def test_delays_of_single_frames_are_taken_as_they_are_and_completed(capture: Ca
     assert np.abs(spline_s).max() > 2e-3
     curve = replace(less, knots=(tuple(knots[::4].tolist()),), values=rows[0][:10], std=rows[1][:10])
     assert not said(planned(shaken, whole.with_fields([curve])))
+
+
+def test_simulate_logs_exposures_without_the_gain_of_the_profile(tmp_path: Path) -> None:
+    """Reading the log with that profile gives each frame the exposure that it was taken with."""
+    gain = (0.5, 2.0, 1.25)
+    camera = nominal_camera(64, 48).with_extensions(exposure_gain=gain)
+    simulate_command(tmp_path / "off", frames=5, profile=camera, exposure_ms=[4.0], rate_rad_s=0.5, seed=3)
+    off = read_capture(tmp_path / "off")
+    exposures_ms = [[1e3 * (f.exposure_s or 0.0) for f in frames] for frames in (off.frames, at_true_times(
+        off.frames, resolve_profile(off)[0]))]  # fmt: skip
+    np.testing.assert_allclose(exposures_ms, [[8.0, 2.0, 3.2, 4.0, 4.0], [4.0] * 5], rtol=1e-6)
 
 
 def test_simulate_logs_exposures_as_late_as_the_profile_says(tmp_path: Path) -> None:
