@@ -3,49 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
 from diagnosis.test_photometry import FRAMES, NOMINAL, dimmed, hidden, made_observations
-from motion.synthetic_tracks import Recording, Setup
 from numpy.typing import NDArray
 
-from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
-from virest.camera.shutter import Shutter
 from virest.capture.records import Frame
 from virest.diagnosis.findings import (
-    CONSISTENT,
-    EXPLAINED,
-    GEOMETRY,
-    UNEXPLAINED,
-    Diagnosis,
-    FieldFinding,
     Finding,
-    HeldOutGain,
-    Nominal,
-    ParameterChange,
-    Remaining,
 )
-from virest.diagnosis.followed_log import (
-    OwnExposures,
-    exposures_of_points,
-    rows_late,
-    with_followed_log,
-    with_late_exposures,
-    with_own_exposures_told,
-)
-from virest.diagnosis.geometric_evidence import Model, make_evidence
-from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.diagnosis.followed_log import with_followed_log
 from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.picture_ladder import PictureVerdict, climb_observations
-from virest.inference.even_light import LevelChange
 
 Array = NDArray[np.float64]
-ALTERNATING = Setup(seed=71, frames=45, points=40, exposure_s=0.01, exposure_swing=0.4, rate_rad_s=0.8)
-"""Exposures that change by 40 %, and their log has one value."""
 STEPS = 0.5 * np.sin(0.4 * (np.arange(FRAMES) // 6 * 6) + 0.3)
 """Log exposure × ISO of the frames, which changes every sixth frame."""
 
@@ -120,121 +93,3 @@ def test_independent_gains_have_no_rival(rng: np.random.Generator) -> None:
     dimming = told(seen(STEPS - 0.4 * np.arange(FRAMES) / FRAMES, STEPS, rng), frames_of(STEPS))
     assert (dimming.name, dimming.rivals) == ("gain_drift", ())
     assert dimming.sentence.endswith("the gains follow time, a straight line")
-
-
-@pytest.mark.parametrize(
-    ("rows", "size", "timestamp", "named"),
-    [
-        (2, 1.0, "exposure_start", "2 frames late"),
-        (-1, 1.0, "exposure_start", "1 frame early"),
-        (1, 1.0, "exposure_end", "1 frame late"),
-        (1, 1.0, "exposure_middle", None),
-        (2, 2.0, "exposure_start", None),
-    ],
-)
-def test_delays_of_the_mid_exposures_have_the_exposure_table_as_rival(
-    rows: int, size: float, timestamp: str, named: str | None, rng: np.random.Generator
-) -> None:
-    """Half of the difference of the exposures, and neither twice that nor anything where stamps mark the middle."""
-    exposure_s = 0.01 + 0.005 * rng.random(60)
-    frames = [Frame(k, 0, k / 30, float(e)) for k, e in enumerate(exposure_s)]
-    shutter = Shutter(0.02, timestamp=timestamp)
-    start_s = np.array([shutter.first_row_start_s(frame.time_s, frame.exposure_s) for frame in frames])
-    other_s = exposure_s[np.clip(np.arange(60) + rows, 0, 59)] - exposure_s
-    late_s = size * (-0.5 if timestamp == "exposure_end" else 0.5) * other_s + rng.normal(0, 1e-5, 60)
-    late = Field("delay", ("time",), (tuple(start_s.tolist()),), tuple((float(v),) for v in late_s), (), 0)
-    gain = HeldOutGain(GEOMETRY, 1.0, 0.1, 0.1)
-    found = FieldFinding(("time",), "delay", "jitter", "late", 0.002, "s", None, gain, 1e-9, (), 1.0, "", "", (late,))
-    told = with_late_exposures(found, rows_late(found, frames, CameraProfile(640, 480, shutter=shutter)))
-    assert told.confounded == (() if named is None else (f"exposure times logged {named}",))
-    assert (told == found) is (named is None)
-
-
-def _judged(
-    left_px: float, noise_px: float, *, unexplained: bool = False, fields: tuple[FieldFinding, ...] = ()
-) -> Diagnosis:
-    nominal = Nominal(left_px, noise_px, None, None, 500, 90)
-    left = Remaining(1e-9 if unexplained else 0.5, "time", 0.5, 0.3, GEOMETRY, unexplained)
-    verdict = UNEXPLAINED if unexplained else EXPLAINED if fields else CONSISTENT
-    profile = CameraProfile(640, 480)
-    residuals = {"before": {"x_px": left_px}, "after": {"x_px": left_px}}
-    return Diagnosis(verdict, nominal, (), left, profile, profile, fields=fields, residuals=residuals)
-
-
-@pytest.mark.parametrize(
-    ("left_px", "noise_px", "unexplained", "better"),
-    [(0.32, 0.3, False, True), (0.42, 0.4, False, True), (0.5, 0.3, False, False), (0.32, 0.3, True, False)],
-)
-def test_an_exposure_table_that_explains_as_much_as_a_delay_of_each_frame_is_the_finding(
-    left_px: float, noise_px: float, unexplained: bool, better: bool
-) -> None:
-    """As much of what exceeds the noise, which another tracking may have changed, and nothing new left."""
-    gain = HeldOutGain(GEOMETRY, 1.0, 0.31, 0.3)
-    late = FieldFinding(("time",), "delay", "jitter", "late", 0.002, "s", None, gain, 1e-9, (), 1.0, "", "")
-    found, given = _judged(1.1, 0.3, fields=(late,)), _judged(left_px, noise_px, unexplained=unexplained)
-    told = with_own_exposures_told(found, given, OwnExposures(-1))
-    if not better:
-        assert told is found
-        return
-    (table,) = told.fields
-    assert (table.kind, table.size, table.p_value, told.verdict) == ("exposure_rows", -1.0, 1e-9, EXPLAINED)
-    assert "logged 1 frame early" in table.sentence
-    assert table.held_out.gain == pytest.approx(1 - (left_px**2 - noise_px**2) / (1 - noise_px**2))
-    assert told.nominal is found.nominal
-    assert (told.residuals["before"], told.residuals["after"]) == ({"x_px": 1.1}, {"x_px": left_px})
-
-
-def _unlogged(seed: int, gain: np.ndarray, missing: tuple[int, ...] = ()) -> OwnExposures | None:
-    """Exposures that a recording's points confirm; the log has one value.
-
-    gain: (frames,) of the light, without a value for the frames in ``missing``.
-    """
-    camera = Recording(replace(ALTERNATING, seed=seed))
-    observed = replace(camera.observed, exposure_s=np.full(len(camera.stamp_s), ALTERNATING.exposure_s))
-    pairs = tuple(replace(p, levels=LevelChange(gain[p.second] / gain[p.first])) for p in observed.pairs)
-    evidence = make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), replace(observed, pairs=pairs))
-    model = Model(camera.profile.with_curve(kind="linear"), None, ())
-    std = [np.nan if k in missing else 0.01 for k in range(len(gain))]
-    told = [1.0 if k in missing else g for k, g in enumerate(gain.tolist())]
-    change = ParameterChange([1.0] * len(gain), told, std)
-    drift = Finding("gain_drift", {"gain": change}, HeldOutGain("photometric_rms", 9.0, 1.0, 1.0), (), 0.0, "")
-    verdict = SimpleNamespace(evidence=evidence, nominal=model, model=model)
-    return exposures_of_points(cast(GeometricVerdict, verdict), [], drift, delays=False)
-
-
-@pytest.mark.parametrize("missing", [(), (5, 6, 20)])
-def test_exposures_that_change_unlogged_are_told_from_a_gain(missing: tuple[int, ...]) -> None:
-    """Their scale comes from the points; frames whose brightness was not measured take it from their neighbour's."""
-    camera = Recording(ALTERNATING)
-    true = camera.exposure_s / ALTERNATING.exposure_s
-    found = _unlogged(ALTERNATING.seed, 1.7 * true, missing)
-    assert found is not None
-    assert found.p_value is not None
-    assert found.p_value < 1e-3
-    np.testing.assert_allclose(found.gain, true, rtol=0.06)
-
-
-def test_light_that_changes_is_no_exposure() -> None:
-    """Gains that the exposures do not share, in none of six seeds."""
-    rng = np.random.default_rng(5)
-    for seed in range(71, 77):
-        assert _unlogged(seed, np.exp(rng.normal(0, 0.2, ALTERNATING.frames))) is None
-
-
-def test_unlogged_exposures_are_the_finding_if_they_leave_no_gain() -> None:
-    """One account of delays and gains; a gain that remains shows another cause."""
-    drift = Finding("gain_drift", {}, HeldOutGain("photometric_rms", 9.0, 1.0, 1.0), (), 0.0, "")
-    found, given = replace(_judged(1.1, 0.3), causes=(drift,)), _judged(0.31, 0.3)
-    found = replace(found, fields=(FieldFinding(
-        ("time",), "delay", "jitter", "late", 0.002, "s", None, HeldOutGain(GEOMETRY, 1.0, 0.31, 0.3), 1e-9, (), 1.0,
-        "", ""),))  # fmt: skip
-    own = OwnExposures(gain=(0.6, 1.45, 0.6), p_value=1e-6)
-    told = with_own_exposures_told(found, given, own)
-    (table,) = told.fields
-    assert (table.kind, table.size, table.unit) == ("exposure_gain", pytest.approx(0.45), "1")
-    assert table.p_value == 1e-6
-    assert not told.causes
-    assert with_own_exposures_told(found, replace(given, causes=(drift,)), own) is found
-    profile = own.on(CameraProfile(640, 480).with_extensions(exposure_gain=(2.0,)))
-    assert profile.extensions.exposure_gain == pytest.approx((1.2, 1.45, 0.6))
-    assert OwnExposures(-1).on(profile).extensions.exposures_late_frames == -1

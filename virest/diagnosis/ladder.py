@@ -46,17 +46,17 @@ from virest.diagnosis.findings import (
     Nominal,
     Rival,
 )
-from virest.diagnosis.followed_log import (
-    OwnExposures,
-    exposures_of_points,
-    rows_late,
-    with_followed_log,
-    with_late_exposures,
-    with_own_exposures_told,
-)
+from virest.diagnosis.followed_log import with_followed_log
 from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with_unknowns_of
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.diagnosis.own_exposures import (
+    OwnExposures,
+    exposures_of_points,
+    rows_late,
+    with_late_exposures,
+    with_own_exposures_told,
+)
 from virest.diagnosis.photometry_fit import fit_photometry
 from virest.diagnosis.picture_ladder import PictureVerdict, Reader, climb_blur, climb_light, judge_curve, light_varies
 from virest.diagnosis.refit_photometry import settle_light

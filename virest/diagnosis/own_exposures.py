@@ -1,0 +1,236 @@
+"""Exposure times other than the logged ones: those of other rows of the table, or ones that change as brightness does.
+
+A timestamp marks an instant of the exposure, so a frame whose exposure time is logged wrongly is seen earlier or later
+than its stamp says: a delay of each frame, with no number of its own.  The capture is then diagnosed again with the
+frames' own exposures, and the better account is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from virest.arrays import Array
+from virest.camera.profile import CameraProfile
+from virest.camera.response import ResponseCurve
+from virest.camera.shutter import STAMP_FRACTION
+from virest.capture.records import Frame
+from virest.diagnosis.candidates import varies
+from virest.diagnosis.cross_validation import JUDGE_POINTS
+from virest.diagnosis.field.forms import TIME
+from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION
+from virest.diagnosis.findings import (
+    EXPLAINED,
+    GEOMETRY,
+    UNEXPLAINED,
+    Diagnosis,
+    FieldFinding,
+    Finding,
+    HeldOutGain,
+    ParameterChange,
+)
+from virest.diagnosis.geometric_evidence import Evidence, Model
+from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.diagnosis.selection import WORD_LEVELS
+from virest.image_formation.row_clock import RowClock
+from virest.inference.chance import chance_of
+from virest.inference.hold_out import group_means, loss
+from virest.inference.profile_terms import TERMS
+from virest.inference.tracking import TrackPair
+from virest.restoration.frame_time_plan import ROWS_LATE, rows_apart
+
+TABLE = "exposure_rows"
+"""Kind of the finding for an exposure table that is some rows off; ``extensions.exposures_late_frames`` holds it."""
+UNLOGGED = "exposure_gain"
+"""Kind of the finding for exposure times that change unlogged; ``extensions.exposure_gain`` holds them."""
+LEAST_FRAMES = 3
+"""Least frames whose delays are compared with exposures: an offset and a factor are fitted to them."""
+FROM_ONE = 0.25
+"""Largest difference from 1 of the factor by which gains follow another frame's exposure × ISO: half way to the factor
+of an encoder that is late by half a frame (DELAY_FRAMES)."""
+DELAYED_P = 0.01
+"""p value of exposures of other rows from which the capture is diagnosed with them; what they leave decides."""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnExposures:
+    """The frames' own exposures: those of other rows of the table, or the logged ones times a factor each."""
+
+    rows_late: int = 0
+    gain: tuple[float, ...] = ()
+    p_value: float | None = None
+    """Probability of points that agree so much better with them; None: that of the delay that they explain."""
+
+    def on(self, profile: CameraProfile) -> CameraProfile:
+        """A profile that gives the frames these exposures."""
+        ext = profile.extensions
+        rows, gain = ext.exposures_late_frames + self.rows_late, ext.exposure_gain
+        if self.gain:
+            gain = tuple((ext.exposure_gain_of(range(len(self.gain))) * np.array(self.gain)).tolist())
+        return profile.with_extensions(exposures_late_frames=rows, exposure_gain=gain)
+
+
+def rows_late(finding: FieldFinding, frames: Sequence[Frame], profile: CameraProfile) -> int:
+    """Rows by which the exposure table is off if a delay of frames has the shape and size of that; else 0.
+
+    frames: all of the movie, by index.  With the exposure of the frame that is N rows away, mid-exposures move by
+    half of the difference if a timestamp marks the exposure's start.
+    """
+    if (finding.kind, finding.covariates) != ("delay", (TIME,)):
+        return 0
+    (late,), shutter, clock = finding.fields, profile.shutter, RowClock(profile)
+    exposure_s = np.array([frame.exposure_s or np.nan for frame in frames])
+    start_s = np.array([clock.start_on_camera_s(frame.time_s, frame.exposure_s or 0.0) for frame in frames])
+    seen = (start_s >= late.knots[0][0]) & (start_s <= late.knots[0][-1])
+    if seen.sum() < LEAST_FRAMES:  # a step has its two knots between two frames
+        return 0
+    found_s = late.at_time(start_s[seen])[:, 0]
+    for rows in ROWS_LATE:
+        moved = np.clip(np.arange(len(frames)) + rows, 0, len(frames) - 1)
+        other_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(exposure_s[moved] - exposure_s)
+        expected_s = other_s[seen] - np.mean(other_s[seen])
+        if not np.isfinite(expected_s).all() or not np.any(expected_s):
+            continue
+        factor = float(expected_s @ found_s / (expected_s @ expected_s))
+        left_s = found_s - np.mean(found_s) - factor * expected_s
+        if np.var(left_s) < (1 - RIVAL_GAIN_FRACTION) * np.var(found_s) and abs(factor - 1) < FROM_ONE:
+            return rows
+    return 0
+
+
+def with_late_exposures(finding: FieldFinding, rows: int) -> FieldFinding:
+    """A delay of frames with the exposure table, ``rows`` off, as rival; 0: it is none."""
+    if not rows:
+        return finding
+    rival = f"exposure times logged {rows_apart(rows)}"
+    sentence = f"{finding.sentence}; {rival} would explain it"
+    return replace(finding, confounded=(*finding.confounded, rival), sentence=sentence)
+
+
+def exposures_of_points(
+    geometric: GeometricVerdict, frames: Sequence[Frame], drift: Finding | None, delays: bool
+) -> OwnExposures | None:
+    """Exposures with which the points agree better than with the logged ones: of other rows, or as brightness changes.
+
+    frames: all of the movie, by index.  drift: gains of the frames' light, up to a factor.  delays: whether frames are
+    late by times of their own, which rows of a table may explain.
+
+    A frame whose exposure time changes unlogged is brighter or darker, and its points are seen earlier or later, by
+    half of the change where stamps mark its start.  Points are compared with the model at the ladder's end, and with
+    the given one and its clocks, since a cause may have taken the delays' place.  Rows need less evidence here, since
+    what they leave of the delays is judged again; an exposure is shorter than a frame.
+    """
+    evidence = geometric.evidence
+    if evidence is None or not evidence.observed.exposure_known:
+        return None
+    tried: list[tuple[int, Array]] = []
+    exposure_s = np.array([frame.exposure_s or np.nan for frame in frames])
+    if delays and np.isfinite(exposure_s).all() and varies(exposure_s):
+        moved = (np.clip(np.arange(len(frames)) + rows, 0, len(frames) - 1) for rows in ROWS_LATE)
+        tried += [(rows, exposure_s[m] / exposure_s) for rows, m in zip(ROWS_LATE, moved, strict=True)]
+    if drift is not None:
+        tried.append((0, _completed(drift.parameters["gain"], evidence.observed.pairs, geometric.model.profile.curve)))
+    models = _with_terms(geometric.nominal, "time_offset", "clock_skew"), geometric.model
+    found = []
+    for rows, gain in tried:
+        for model in models:
+            scaled, p_value = _compared_exposures(evidence, _with_terms(model, "exposure_time"), gain)
+            p_value *= len(tried) * len(models)
+            if rows and p_value < DELAYED_P:
+                found.append((p_value, OwnExposures(rows)))
+            fits = evidence.exposure_s * max(scaled) < evidence.period_s
+            if not rows and fits and WORD_LEVELS.significant(p_value):
+                found.append((p_value, OwnExposures(gain=scaled, p_value=p_value)))
+    return min(found, key=lambda one: one[0])[1] if found else None
+
+
+def _with_terms(model: Model, *names: str) -> Model:
+    """A model that is fitted with further causes."""
+    known = {term.name for term in model.terms}
+    return replace(model, terms=(*model.terms, *(TERMS[name] for name in names if name not in known)))
+
+
+def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> tuple[tuple[float, ...], float]:
+    """(factors proportional to ``gain`` that fit best, p value of a smaller loss with them).
+
+    The loss is compared in each time block with that of the logged exposures; their scale is fitted too.
+    """
+    logged, gain = evidence.table(model, JUDGE_POINTS), gain / gain.mean()
+    own = replace(
+        logged,
+        first_exposure_s=logged.first_exposure_s * gain[logged.first],
+        second_exposure_s=logged.second_exposure_s * gain[logged.second],
+    )
+    fits = [evidence.fit(model, model.terms, table) for table in (logged, own)]
+    scale = min(fit.scale for fit in fits)
+    before, after = (group_means(loss(fit.distance, scale), evidence.block[logged.pair]) for fit in fits)
+    longer = fits[1].profile.shutter.exposure_scale / model.profile.shutter.exposure_scale
+    return tuple((longer * gain).tolist()), chance_of(before - after)
+
+
+def _completed(gain: ParameterChange, pairs: Sequence[TrackPair], curve: ResponseCurve) -> Array:
+    """Gains (frames,) over the given ones; without patches, a frame's follows from the next and the points' light."""
+    log_gain = np.log(np.array(gain.estimate, float) / np.array(gain.nominal, float))
+    known = np.isfinite(np.array(gain.std, float))
+    steps = [(pair.first, pair.second, pair.levels.log_light(curve)) for pair in pairs]
+    for start, end, step in [*steps, *((second, first, -step) for first, second, step in reversed(steps))]:
+        if known[start] and not known[end]:
+            log_gain[end], known[end] = log_gain[start] + step, True
+    return np.exp(log_gain)
+
+
+def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposures) -> Diagnosis:
+    """One of two diagnoses: of the capture as logged, and with each frame's own exposure.
+
+    A table that is off has no free number besides its rows, and exposures that follow the light have none.  They are
+    the better account if they remove as much as a rival of a delay of each frame must, and nothing is left in the
+    points, and no gain of the light, that was not before.
+    """
+    over_time = (field for field in found.fields if (field.kind, field.covariates) == ("delay", (TIME,)))
+    delay = next(over_time, None)
+    nominal = found.nominal
+    held_out = HeldOutGain(GEOMETRY, nominal.geometry_rms_px, _points_left_px(found), nominal.geometry_noise_px)
+    held_out = held_out if delay is None else delay.held_out
+    gain = replace(held_out, after=_points_left_px(given), noise=given.nominal.geometry_noise_px)
+    if (gain.gain or 0.0) < RIVAL_GAIN_FRACTION * (held_out.gain or 0.0):
+        return found
+    if given.unexplained.significant and not found.unexplained.significant:
+        return found
+    if own.gain and any(cause.name == "gain_drift" for cause in given.causes):
+        return found
+    points = f"(points {gain.before:.3f} px → {gain.after:.3f} px): with its own, each frame is where the points are"
+    if own.gain:
+        size = max(own.gain, key=lambda g: abs(g - 1)) - 1
+        told = FieldFinding(
+            ("exposure",), UNLOGGED, "as the brightness",
+            f"exposure times change as the brightness does, up to {size:+.0%} of those logged {points}",
+            size, "1", None, gain, own.p_value, (), None,
+            "a sensor that alternates exposures (HDR), or a log of the exposures that were asked for",
+            "film an LED display that counts milliseconds, and compare the counts in a frame with its exposure time",
+        )  # fmt: skip
+    else:
+        apart = rows_apart(own.rows_late)
+        told = FieldFinding(
+            ("exposure",), TABLE, apart, f"exposure times and ISO values are logged {apart} {points}",
+            float(own.rows_late), "frames", None, gain, None if delay is None else delay.p_value, (), None,
+            "a recorder that joins two queues, or an encoder that drops its first frames",
+            "film a lamp that is switched on, and compare the row of the jump with the frame of the jump",
+        )  # fmt: skip
+    verdict = UNEXPLAINED if given.unexplained.significant else EXPLAINED
+    return replace(
+        given,
+        verdict=verdict,
+        nominal=found.nominal,
+        nominal_profile=found.nominal_profile,
+        fields=(told, *given.fields),
+        residuals={**given.residuals, "before": found.residuals["before"]},
+    )
+
+
+def _points_left_px(found: Diagnosis) -> float:
+    """Held-out rms of the points with all that a diagnosis adds."""
+    fields = [field.held_out.after for field in found.fields if field.held_out.quantity == GEOMETRY]
+    rungs = [rung.tried.get(rung.entered or "", rung.before) for rung in found.ladder if rung.quantity == GEOMETRY]
+    return min(fields) if fields else [found.nominal.geometry_rms_px, *rungs][-1]
