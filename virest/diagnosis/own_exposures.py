@@ -18,7 +18,7 @@ from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.records import Frame
 from virest.diagnosis.candidates import varies
-from virest.diagnosis.cross_validation import JUDGE_POINTS
+from virest.diagnosis.cross_validation import JUDGE_POINTS, LAGGING_BLOCK
 from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION
 from virest.diagnosis.findings import (
@@ -155,7 +155,8 @@ def _with_terms(model: Model, *names: str) -> Model:
 def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> tuple[tuple[float, ...], float]:
     """(factors proportional to ``gain`` that fit best, p value of a smaller loss with them).
 
-    The loss is compared in each time block with that of the logged exposures; their scale is fitted too.
+    The loss is compared with that of the logged exposures in each two pairs: neighbours share a frame and its exposure.
+    The exposures' scale is fitted in both.
     """
     logged, gain = evidence.table(model, JUDGE_POINTS), gain / gain.mean()
     own = replace(
@@ -165,7 +166,7 @@ def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> tuple[
     )
     fits = [evidence.fit(model, model.terms, table) for table in (logged, own)]
     scale = min(fit.scale for fit in fits)
-    before, after = (group_means(loss(fit.distance, scale), evidence.block[logged.pair]) for fit in fits)
+    before, after = (group_means(loss(fit.distance, scale), logged.pair // LAGGING_BLOCK) for fit in fits)
     longer = fits[1].profile.shutter.exposure_scale / model.profile.shutter.exposure_scale
     return tuple((longer * gain).tolist()), chance_of(before - after)
 
@@ -185,8 +186,8 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
     """One of two diagnoses: of the capture as logged, and with each frame's own exposure.
 
     A table that is off has no free number besides its rows, and exposures that follow the light have none.  They are
-    the better account if they remove as much as a rival of a delay of each frame must, and nothing is left in the
-    points, and no gain of the light, that was not before.
+    the better account if they remove as much as a rival of a delay of each frame must.  With other rows, nothing may be
+    left in the points that was not before; with exposures as exact as measured brightness, no gain of the light.
     """
     over_time = (field for field in found.fields if (field.kind, field.covariates) == ("delay", (TIME,)))
     delay = next(over_time, None)
@@ -196,9 +197,8 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
     gain = replace(held_out, after=_points_left_px(given), noise=given.nominal.geometry_noise_px)
     if (gain.gain or 0.0) < RIVAL_GAIN_FRACTION * (held_out.gain or 0.0):
         return found
-    if given.unexplained.significant and not found.unexplained.significant:
-        return found
-    if own.gain and any(cause.name == "gain_drift" for cause in given.causes):
+    remains = any(cause.name == "gain_drift" for cause in given.causes)
+    if remains if own.gain else given.unexplained.significant and not found.unexplained.significant:
         return found
     points = f"(points {gain.before:.3f} px → {gain.after:.3f} px): with its own, each frame is where the points are"
     if own.gain:
