@@ -50,6 +50,8 @@ LEAST_FRAMES = 3
 FROM_ONE = 0.25
 """Largest difference from 1 of the factor by which gains follow another frame's exposure × ISO: half way to the factor
 of an encoder that is late by half a frame (DELAY_FRAMES)."""
+CLOCKS, SURE = ("time_offset", "clock_skew"), 3.0
+"""Terms of the clocks, and the standard deviations from which the given ones are wrong."""
 DELAYED_P = 0.01
 """p value of exposures of other rows from which the capture is diagnosed with them; what they leave decides."""
 
@@ -119,8 +121,8 @@ def exposures_of_points(
 
     A frame whose exposure time changes unlogged is brighter or darker, and its points are seen earlier or later, by
     half of the change where stamps mark its start.  Points are compared with the model at the ladder's end, and with
-    the given one and its clocks, since a cause may have taken the delays' place.  Rows need less evidence here, since
-    what they leave of the delays is judged again; an exposure is shorter than a frame.
+    the given one, without and with its clocks, since a cause may have taken the delays' place.  Rows need less evidence
+    here, since what they leave of the delays is judged again; an exposure is shorter than a frame.
     """
     evidence = geometric.evidence
     if evidence is None or not evidence.observed.exposure_known:
@@ -132,7 +134,7 @@ def exposures_of_points(
         tried += [(rows, exposure_s[m] / exposure_s) for rows, m in zip(ROWS_LATE, moved, strict=True)]
     if drift is not None:
         tried.append((0, _completed(drift.parameters["gain"], evidence.observed.pairs, geometric.model.profile.curve)))
-    models = _with_terms(geometric.nominal, "time_offset", "clock_skew"), geometric.model
+    models = geometric.nominal, _with_terms(geometric.nominal, *CLOCKS), geometric.model
     found = []
     for rows, gain in tried:
         for model in models:
@@ -156,7 +158,8 @@ def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> tuple[
     """(factors proportional to ``gain`` that fit best, p value of a smaller loss with them).
 
     The loss is compared with that of the logged exposures in each two pairs: neighbours share a frame and its exposure.
-    The exposures' scale is fitted in both.
+    The exposures' scale is fitted in both.  A longer exposure resembles an offset, so clocks that are right as given
+    are not fitted beside the scale.
     """
     logged, gain = evidence.table(model, JUDGE_POINTS), gain / gain.mean()
     own = replace(
@@ -167,7 +170,11 @@ def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> tuple[
     fits = [evidence.fit(model, model.terms, table) for table in (logged, own)]
     scale = min(fit.scale for fit in fits)
     before, after = (group_means(loss(fit.distance, scale), logged.pair // LAGGING_BLOCK) for fit in fits)
-    longer = fits[1].profile.shutter.exposure_scale / model.profile.shutter.exposure_scale
+    fitted = fits[1]
+    clocks = [name for name in CLOCKS if name in fitted.slices]
+    if clocks and all(np.all(np.abs(fitted.value(name)) < SURE * fitted.std(name)) for name in clocks):
+        fitted = evidence.fit(model, [term for term in model.terms if term.name not in clocks], own)
+    longer = fitted.profile.shutter.exposure_scale / model.profile.shutter.exposure_scale
     return tuple((longer * gain).tolist()), chance_of(before - after)
 
 
