@@ -103,7 +103,7 @@ FULL = CameraProfile(
         0.8,
         exposures_late_frames=2,
         exposure_gain=(1.4, 0.6, 1.4),
-    ),  # fmt: skip,
+    ),
 )
 
 

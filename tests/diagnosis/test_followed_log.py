@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from virest.camera.profile import CameraProfile
 from virest.capture.records import Frame
-from virest.diagnosis.findings import (
-    Finding,
-)
+from virest.diagnosis.findings import Finding
 from virest.diagnosis.followed_log import with_followed_log
 from virest.diagnosis.photometry import PhotometricObservations
 from virest.diagnosis.picture_ladder import PictureVerdict, climb_observations

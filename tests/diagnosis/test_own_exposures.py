@@ -167,4 +167,11 @@ def test_unlogged_exposures_are_the_finding_if_they_leave_no_gain() -> None:
     assert with_own_exposures_told(found, replace(given, causes=(drift,)), own) is found
     profile = own.on(CameraProfile(640, 480).with_extensions(exposure_gain=(2.0,)))
     assert profile.extensions.exposure_gain == pytest.approx((1.2, 1.45, 0.6))
+    scale = Finding("exposure_time", {}, HeldOutGain("blur_rms_px", 2.0, 1.0, 1.0), (), 0.0, "")
+    halved = own.on(CameraProfile(640, 480)).with_shutter(exposure_scale=0.5)
+    told = with_own_exposures_told(found, replace(given, causes=(scale,), extended_profile=halved), own)
+    assert not told.causes  # one factor for all exposures is theirs
+    assert told.extended_profile.shutter.exposure_scale == 1.0
+    assert told.extended_profile.extensions.exposure_gain == pytest.approx((0.3, 0.725, 0.3))
+    assert told.fields[0].size == pytest.approx(-0.7)
     assert OwnExposures(-1).on(profile).extensions.exposures_late_frames == -1

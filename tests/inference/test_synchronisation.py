@@ -390,7 +390,7 @@ def test_a_shaken_phone_gives_an_offset_of_nearly_half_a_second() -> None:
     assert 0.39 < found.time_offset_s < 0.47
     assert abs(found.time_offset_s + 0.5 * recorded[2].shutter.readout_time_s - 0.461) < 0.006
     assert found.std_s > 0.005
-    assert found.drift_s_per_s > 0.001
+    assert 0.003 < found.drift_s_per_s < 0.007  # with calibrate 0.0048 ± 0.0004
     assert check_agreement(*recorded[:2], replace(recorded[2], time_offset_s=found.time_offset_s)).agrees
 
 

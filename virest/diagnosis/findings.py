@@ -90,7 +90,7 @@ class FieldFinding:
 
     covariates: tuple[str, ...]
     kind: str
-    """As of :mod:`virest.camera.field`, ``inertial_rows`` or ``exposure_rows``."""
+    """As of :mod:`virest.camera.field`, ``inertial_rows``, ``exposure_rows`` or ``exposure_gain``."""
     shape: str
     sentence: str
     """What it does, for people."""

@@ -22,11 +22,7 @@ from virest.capture.records import Frame
 from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.screening import RIVAL_GAIN_FRACTION
 from virest.diagnosis.field.words import SAMPLES, curve_shape
-from virest.diagnosis.findings import (
-    Finding,
-    HeldOutGain,
-    Rival,
-)
+from virest.diagnosis.findings import Finding, HeldOutGain, Rival
 from virest.diagnosis.own_exposures import FROM_ONE
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import FollowedGain

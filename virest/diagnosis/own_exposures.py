@@ -34,10 +34,12 @@ from virest.diagnosis.findings import (
 from virest.diagnosis.geometric_evidence import Evidence, Model
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.selection import WORD_LEVELS
+from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import RowClock
 from virest.inference.chance import chance_of
 from virest.inference.hold_out import group_means, loss
 from virest.inference.profile_terms import TERMS
+from virest.inference.track_fit import TrackFit
 from virest.inference.tracking import TrackPair
 from virest.restoration.frame_time_plan import ROWS_LATE, rows_apart
 
@@ -63,7 +65,7 @@ class OwnExposures:
     rows_late: int = 0
     gain: tuple[float, ...] = ()
     p_value: float | None = None
-    """Probability of points that agree so much better with them; None: that of the delay that they explain."""
+    """Probability that the points agree so much better by chance; None: that of the delay that they explain."""
 
     def on(self, profile: CameraProfile) -> CameraProfile:
         """A profile that gives the frames these exposures."""
@@ -136,9 +138,11 @@ def exposures_of_points(
         tried.append((0, _completed(drift.parameters["gain"], evidence.observed.pairs, geometric.model.profile.curve)))
     models = geometric.nominal, _with_terms(geometric.nominal, *CLOCKS), geometric.model
     found = []
-    for rows, gain in tried:
-        for model in models:
-            scaled, p_value = _compared_exposures(evidence, _with_terms(model, "exposure_time"), gain)
+    for model in (_with_terms(model, "exposure_time") for model in models):
+        logged = evidence.table(model, JUDGE_POINTS)
+        as_logged = evidence.fit(model, model.terms, logged)
+        for rows, gain in tried:
+            scaled, p_value = _compared_exposures(evidence, model, logged, as_logged, gain / gain.mean())
             p_value *= len(tried) * len(models)
             if rows and p_value < DELAYED_P:
                 found.append((p_value, OwnExposures(rows)))
@@ -154,23 +158,25 @@ def _with_terms(model: Model, *names: str) -> Model:
     return replace(model, terms=(*model.terms, *(TERMS[name] for name in names if name not in known)))
 
 
-def _compared_exposures(evidence: Evidence, model: Model, gain: Array) -> tuple[tuple[float, ...], float]:
+def _compared_exposures(
+    evidence: Evidence, model: Model, logged: TrackTable, as_logged: TrackFit, gain: Array
+) -> tuple[tuple[float, ...], float]:
     """(factors proportional to ``gain`` that fit best, p value of a smaller loss with them).
 
     The loss is compared with that of the logged exposures in each two pairs: neighbours share a frame and its exposure.
     The exposures' scale is fitted in both.  A longer exposure resembles an offset, so clocks that are right as given
     are not fitted beside the scale.
     """
-    logged, gain = evidence.table(model, JUDGE_POINTS), gain / gain.mean()
     own = replace(
         logged,
         first_exposure_s=logged.first_exposure_s * gain[logged.first],
         second_exposure_s=logged.second_exposure_s * gain[logged.second],
     )
-    fits = [evidence.fit(model, model.terms, table) for table in (logged, own)]
-    scale = min(fit.scale for fit in fits)
-    before, after = (group_means(loss(fit.distance, scale), logged.pair // LAGGING_BLOCK) for fit in fits)
-    fitted = fits[1]
+    fitted = evidence.fit(model, model.terms, own)
+    scale = min(as_logged.scale, fitted.scale)
+    before, after = (
+        group_means(loss(fit.distance, scale), logged.pair // LAGGING_BLOCK) for fit in (as_logged, fitted)
+    )
     clocks = [name for name in CLOCKS if name in fitted.slices]
     if clocks and all(np.all(np.abs(fitted.value(name)) < SURE * fitted.std(name)) for name in clocks):
         fitted = evidence.fit(model, [term for term in model.terms if term.name not in clocks], own)
@@ -207,12 +213,15 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
     remains = any(cause.name == "gain_drift" for cause in given.causes)
     if remains if own.gain else given.unexplained.significant and not found.unexplained.significant:
         return found
+    if own.gain:
+        own, given = _with_one_scale(own, given)
     points = f"(points {gain.before:.3f} px → {gain.after:.3f} px): with its own, each frame is where the points are"
     if own.gain:
         size = max(own.gain, key=lambda g: abs(g - 1)) - 1
         told = FieldFinding(
             ("exposure",), UNLOGGED, "as the brightness",
-            f"exposure times change as the brightness does, up to {size:+.0%} of those logged {points}",
+            f"exposure times change as the brightness does, up to {abs(size):.0%} "
+            f"{'longer' if size > 0 else 'shorter'} than logged {points}",
             size, "1", None, gain, own.p_value, (), None,
             "a sensor that alternates exposures (HDR), or a log of the exposures that were asked for",
             "film an LED display that counts milliseconds, and compare the counts in a frame with its exposure time",
@@ -234,6 +243,23 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
         fields=(told, *given.fields),
         residuals={**given.residuals, "before": found.residuals["before"]},
     )
+
+
+def _with_one_scale(own: OwnExposures, given: Diagnosis) -> tuple[OwnExposures, Diagnosis]:
+    """The exposures, and the diagnosis with them, where a common factor that it found is in theirs.
+
+    Brightness determines them up to a factor, so a further scale of all exposures is no cause of its own.
+    """
+    nominal, extended = given.nominal_profile, given.extended_profile
+    longer = extended.shutter.exposure_scale / nominal.shutter.exposure_scale
+    causes = tuple(cause for cause in given.causes if cause.name != "exposure_time")
+    if len(causes) == len(given.causes):
+        return own, given
+    gains = (tuple((longer * np.array(gain)).tolist()) for gain in (own.gain, extended.extensions.exposure_gain))
+    own_gain, whole_gain = gains
+    extended = extended.with_shutter(exposure_scale=nominal.shutter.exposure_scale)
+    extended = extended.with_extensions(exposure_gain=whole_gain)
+    return replace(own, gain=own_gain), replace(given, causes=causes, extended_profile=extended)
 
 
 def _points_left_px(found: Diagnosis) -> float:

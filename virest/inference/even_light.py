@@ -79,15 +79,12 @@ def level_change(first: Picture, second: Picture, before: NDArray[Any], after: N
 
     With few points that are neither black nor white, the slope is that of the pictures' means.
     """
-    by_mean = LevelChange(float(second.mean()) / max(float(first.mean()), 1.0))
-    if len(before) < LEAST_POINTS:
-        return by_mean
-    x, y = _levels(first, before), _levels(second, after)
+    x, y = (_levels(*seen) if len(before) else np.zeros(0) for seen in ((first, before), (second, after)))
     unclipped = np.isfinite(x + y)
     if unclipped.sum() < LEAST_POINTS:
-        return by_mean
+        return LevelChange(float(second.mean()) / max(float(first.mean()), 1.0))
     x, y = x[unclipped], y[unclipped]
-    line, weight = np.array([1.0, float(np.median(y - x))]), np.ones(len(x))
+    line = np.array([1.0, float(np.median(y - x))])
     terms = np.stack([x, np.ones(len(x))], axis=-1)
     for _ in range(STEPS):
         left = y - terms @ line
@@ -99,8 +96,8 @@ def level_change(first: Picture, second: Picture, before: NDArray[Any], after: N
 def _levels(picture: Picture, points: NDArray[Any]) -> Array:
     """Mean grey levels (n,) of squares around points (n, 2); NaN for squares with clipped pixels."""
     x, y = (np.ascontiguousarray(points[None, :, k], np.float32) for k in (0, 1))
-    clipped = cv2.inRange(picture, CLIPPED[0] + 1, CLIPPED[1] - 1) == 0
-    means, off = (cv2.blur(plane, (SIDE_PX, SIDE_PX)) for plane in (picture, 255 * clipped.astype(np.uint8)))
+    clipped = cv2.bitwise_not(cv2.inRange(picture, CLIPPED[0] + 1, CLIPPED[1] - 1))
+    means, off = (cv2.blur(plane, (SIDE_PX, SIDE_PX)) for plane in (picture, clipped))
     levels, lost = (
         cv2.remap(plane, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0] for plane in (means, off)
     )

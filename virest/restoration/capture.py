@@ -271,18 +271,14 @@ def with_own_exposures(
 
     Those before the first or after the last row keep the nearest one.  exposure_gain: factors on the exposure times.
     """
-    if exposure_gain:
-        gains = (*exposure_gain, *[1.0] * len(frames))
-        others = with_own_exposures(frames, rows_late)
-        return tuple(
-            replace(f, exposure_s=f.exposure_s and f.exposure_s * gain) for f, gain in zip(others, gains, strict=False)
-        )
-    if not rows_late:
+    if not rows_late and not exposure_gain:
         return tuple(frames)
     sources = np.clip(np.arange(len(frames)) + rows_late, 0, len(frames) - 1)
-    own = (frames[int(k)] for k in sources)
+    gains = (*exposure_gain, *[1.0] * len(frames))
+    own = ((frames[int(k)], gain) for k, gain in zip(sources, gains, strict=False))
     return tuple(
-        replace(frame, exposure_s=source.exposure_s, iso=source.iso) for frame, source in zip(frames, own, strict=True)
+        replace(frame, exposure_s=source.exposure_s and source.exposure_s * gain, iso=source.iso)
+        for frame, (source, gain) in zip(frames, own, strict=True)
     )
 
 

@@ -48,8 +48,8 @@ class Hidden:
     """(frame time) → logged focus distance."""
     exposures_late_frames: int = 0
     """Rows by which exposure times and ISO values are logged late (negative: early)."""
-    exposure_gain: tuple[float, ...] = ()
-    """True exposure times over those logged, by movie index; 1 where the list has none."""
+    longer: Callable[[int], float] | None = None
+    """(movie index) → true exposure time over the logged one."""
 
 
 NOTHING = Hidden()

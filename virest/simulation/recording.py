@@ -296,8 +296,9 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
     for k, stamp in enumerate(session.stamp_ns.tolist()):
         own = min(max(k - late, 0), last)
         exposure, iso = session.logged_exposure_s(own), int(session.exposures.iso[own])
-        for log in (nominal.extensions, session.hidden):
-            exposure /= float(log.exposure_gain[own]) if own < len(log.exposure_gain) else 1.0
+        exposure /= float(nominal.extensions.exposure_gain_of(own))
+        if session.hidden.longer is not None:
+            exposure /= session.hidden.longer(own)
         numbers = [
             _logged_ns(stamp, options),
             fx,
