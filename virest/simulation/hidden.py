@@ -48,8 +48,6 @@ class Hidden:
     """(frame time) → logged focus distance."""
     exposures_late_frames: int = 0
     """Rows by which exposure times and ISO values are logged late (negative: early)."""
-    longer: Callable[[int], float] | None = None
-    """(movie index) → true exposure time over the logged one."""
 
 
 NOTHING = Hidden()

@@ -297,8 +297,6 @@ def _write_metadata(folder: Path, session: Session, options: RecordingOptions) -
         own = min(max(k - late, 0), last)
         exposure, iso = session.logged_exposure_s(own), int(session.exposures.iso[own])
         exposure /= float(nominal.extensions.exposure_gain_of(own))
-        if session.hidden.longer is not None:
-            exposure /= session.hidden.longer(own)
         numbers = [
             _logged_ns(stamp, options),
             fx,
