@@ -31,13 +31,13 @@ from virest.diagnosis.findings import (
 from virest.diagnosis.geometric_evidence import Model, make_evidence
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.own_exposures import (
-    OwnExposures,
     exposures_of_points,
     rows_late,
     with_late_exposures,
     with_own_exposures_told,
 )
 from virest.inference.even_light import LevelChange
+from virest.inference.frame_exposures import OwnExposures
 
 Array = NDArray[np.float64]
 ALTERNATING = Setup(seed=71, frames=45, points=40, exposure_s=0.01, exposure_swing=0.4, rate_rad_s=0.8)
@@ -109,7 +109,8 @@ def test_an_exposure_table_that_explains_as_much_as_a_delay_of_each_frame_is_the
 def _unlogged(gain: np.ndarray, missing: tuple[int, ...] = (), setup: Setup = ALTERNATING) -> OwnExposures | None:
     """Exposures that a recording's points confirm; the log has one value.
 
-    gain: (frames,) of the light, without a value for the frames in ``missing``.
+    gain: (frames,) of the light, without a value for the frames in ``missing``; if that is all, only the delays of
+    frames and the brightness of pairs are known.
     """
     camera = Recording(setup)
     observed = replace(camera.observed, exposure_s=np.full(len(camera.stamp_s), setup.exposure_s))
@@ -121,10 +122,12 @@ def _unlogged(gain: np.ndarray, missing: tuple[int, ...] = (), setup: Setup = AL
     change = ParameterChange([1.0] * len(gain), told, std)
     drift = Finding("gain_drift", {"gain": change}, HeldOutGain("photometric_rms", 9.0, 1.0, 1.0), (), 0.0, "")
     verdict = SimpleNamespace(evidence=evidence, nominal=model, model=model)
-    return exposures_of_points(cast(GeometricVerdict, verdict), [], drift, delays=False)
+    frames = [Frame(k, 0, t, setup.exposure_s, iso=100) for k, t in enumerate(camera.stamp_s.tolist())]
+    unmeasured = len(missing) == len(gain)
+    return exposures_of_points(cast(GeometricVerdict, verdict), frames, None if unmeasured else drift, unmeasured)
 
 
-@pytest.mark.parametrize("missing", [(), (5, 6, 20)])
+@pytest.mark.parametrize("missing", [(), (5, 6, 20), tuple(range(ALTERNATING.frames))])
 def test_exposures_that_change_unlogged_are_told_from_a_gain(missing: tuple[int, ...]) -> None:
     """Their scale comes from the points; frames whose brightness was not measured take it from their neighbour's."""
     camera = Recording(ALTERNATING)
@@ -148,7 +151,9 @@ def test_light_that_changes_is_no_exposure() -> None:
     """Gains that the exposures do not share, in none of six seeds."""
     rng = np.random.default_rng(5)
     for seed in range(71, 77):
-        assert _unlogged(np.exp(rng.normal(0, 0.2, 45)), setup=replace(ALTERNATING, seed=seed)) is None
+        gain, setup = np.exp(rng.normal(0, 0.2, 45)), replace(ALTERNATING, seed=seed)
+        assert _unlogged(gain, setup=setup) is None
+        assert _unlogged(gain, tuple(range(45)), setup) is None
 
 
 def test_unlogged_exposures_are_the_finding_if_they_leave_no_gain() -> None:

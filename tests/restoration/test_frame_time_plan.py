@@ -17,7 +17,8 @@ from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.records import Capture
 from virest.capture.video import probe_movie, read_decodable_gray
 from virest.image_formation.row_clock import RowClock
-from virest.restoration.capture import RestorationPlan, at_true_times, with_own_exposures
+from virest.inference.frame_exposures import OwnExposures
+from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.plan_notes import NoteCode
 from virest.restoration.settings import PRESETS
@@ -51,8 +52,7 @@ def said(plan: RestorationPlan) -> list[str]:
 
 def middles_s(capture: Capture, plan: RestorationPlan) -> np.ndarray:
     """Mid-exposure of the middle rows by a plan, IMU clock."""
-    extensions = plan.profile.extensions
-    frames = with_own_exposures(capture.frames, extensions.exposures_late_frames, extensions.exposure_gain)
+    frames = OwnExposures.stated_by(plan.profile).of(capture.frames)
     stamp_s, exposure_s = (np.array([getattr(f, name) for f in frames]) for name in ("time_s", "exposure_s"))
     return np.asarray(RowClock(plan.profile).middle_s(stamp_s, exposure_s))
 
@@ -93,13 +93,25 @@ def test_a_profile_gives_frames_the_exposures_that_the_log_lacks(capture: Captur
     np.testing.assert_allclose(middles_s(flat, plan), middles_s(capture, planned(capture)), atol=1e-9)
 
 
+def test_exposures_that_the_log_lacks_follow_the_brightness(capture: Capture) -> None:
+    """The log has one exposure, and the ISO values of exposures that differ: factors up to a common one."""
+    own_s = np.array([frame.exposure_s for frame in capture.frames], float)
+    flat = replace(capture, frames=tuple(replace(frame, exposure_s=0.01) for frame in capture.frames))
+    plan = planned(flat)
+    assert "differ from the logged ones as brightness does" in said(plan)[-1]
+    factors = np.array(plan.profile.extensions.exposure_gain) / (own_s / own_s.mean())
+    assert np.ptp(factors) < 0.1
+    right_s = middles_s(capture, planned(capture))
+    assert np.std(middles_s(flat, plan) - right_s) < 0.1 * np.std(own_s / 2)
+
+
 @pytest.mark.parametrize("rows", [2, -1])
 def test_exposures_in_other_rows_are_given_back_to_their_frames(capture: Capture, rows: int) -> None:
     """The plan's profile says by how many rows, and a run with that profile finds no more of them.
 
     The last frames, whose rows were never written, may be given delays of their own.
     """
-    late = replace(capture, frames=with_own_exposures(capture.frames, -rows))
+    late = replace(capture, frames=OwnExposures(-rows).of(capture.frames))
     plan = planned(late)
     assert f"logged {abs(rows)} frame" in said(plan)[-1]
     assert plan.profile.extensions.exposures_late_frames == rows

@@ -51,7 +51,6 @@ from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.own_exposures import (
-    OwnExposures,
     exposures_of_points,
     rows_late,
     with_late_exposures,
@@ -75,6 +74,7 @@ from virest.diagnosis.tracking_stage import (
 )
 from virest.errors import CaptureError
 from virest.image_formation.point_model import predict
+from virest.inference.frame_exposures import OwnExposures
 from virest.inference.guide_choice import find_guide, track_guided
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.parallel import Background, ParallelMap, begun, one_by_one

@@ -8,13 +8,12 @@ frames' own exposures, and the better account is told.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.camera.response import ResponseCurve
 from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.records import Frame
 from virest.diagnosis.candidates import varies
@@ -37,11 +36,11 @@ from virest.diagnosis.selection import WORD_LEVELS
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import RowClock
 from virest.inference.chance import chance_of
+from virest.inference.frame_exposures import ROWS_LATE, OwnExposures, by_brightness, unlogged_log_light
 from virest.inference.hold_out import group_means, loss
 from virest.inference.profile_terms import TERMS
 from virest.inference.track_fit import TrackFit
-from virest.inference.tracking import TrackPair
-from virest.restoration.frame_time_plan import ROWS_LATE, rows_apart
+from virest.restoration.frame_time_plan import rows_apart
 
 TABLE = "exposure_rows"
 """Kind of the finding for an exposure table that is some rows off; ``extensions.exposures_late_frames`` holds it."""
@@ -56,24 +55,6 @@ CLOCKS, SURE = ("time_offset", "clock_skew"), 3.0
 """Terms of the clocks, and the standard deviations from which the given ones are wrong."""
 DELAYED_P = 0.01
 """p value of exposures of other rows from which the capture is diagnosed with them; what they leave decides."""
-
-
-@dataclass(frozen=True, slots=True)
-class OwnExposures:
-    """The frames' own exposures: those of other rows of the table, or the logged ones times a factor each."""
-
-    rows_late: int = 0
-    gain: tuple[float, ...] = ()
-    p_value: float | None = None
-    """Probability that the points agree so much better by chance; None: that of the delay that they explain."""
-
-    def on(self, profile: CameraProfile) -> CameraProfile:
-        """A profile that gives the frames these exposures."""
-        ext = profile.extensions
-        rows, gain = ext.exposures_late_frames + self.rows_late, ext.exposure_gain
-        if self.gain:
-            gain = tuple((ext.exposure_gain_of(range(len(self.gain))) * np.array(self.gain)).tolist())
-        return profile.with_extensions(exposures_late_frames=rows, exposure_gain=gain)
 
 
 def rows_late(finding: FieldFinding, frames: Sequence[Frame], profile: CameraProfile) -> int:
@@ -134,8 +115,12 @@ def exposures_of_points(
     if delays and np.isfinite(exposure_s).all() and varies(exposure_s):
         moved = (np.clip(np.arange(len(frames)) + rows, 0, len(frames) - 1) for rows in ROWS_LATE)
         tried += [(rows, exposure_s[m] / exposure_s) for rows, m in zip(ROWS_LATE, moved, strict=True)]
+    pairs, curve = evidence.observed.pairs, geometric.model.profile.curve
     if drift is not None:
-        tried.append((0, _completed(drift.parameters["gain"], evidence.observed.pairs, geometric.model.profile.curve)))
+        measured = _measured_log_light(drift.parameters["gain"])
+        tried.append((0, np.exp(np.nan_to_num(unlogged_log_light(frames, pairs, curve, measured)))))
+    elif delays:
+        tried.append((0, np.array(by_brightness(frames, pairs, curve).gain)))
     models = geometric.nominal, _with_terms(geometric.nominal, *CLOCKS), geometric.model
     found = []
     for model in (_with_terms(model, "exposure_time") for model in models):
@@ -184,15 +169,10 @@ def _compared_exposures(
     return tuple((longer * gain).tolist()), chance_of(before - after)
 
 
-def _completed(gain: ParameterChange, pairs: Sequence[TrackPair], curve: ResponseCurve) -> Array:
-    """Gains (frames,) over the given ones; without patches, a frame's follows from the next and the points' light."""
+def _measured_log_light(gain: ParameterChange) -> Array:
+    """Log gains (frames,) over the given ones; NaN: not measured."""
     log_gain = np.log(np.array(gain.estimate, float) / np.array(gain.nominal, float))
-    known = np.isfinite(np.array(gain.std, float))
-    steps = [(pair.first, pair.second, pair.levels.log_light(curve)) for pair in pairs]
-    for start, end, step in [*steps, *((second, first, -step) for first, second, step in reversed(steps))]:
-        if known[start] and not known[end]:
-            log_gain[end], known[end] = log_gain[start] + step, True
-    return np.exp(log_gain)
+    return np.where(np.isfinite(np.array(gain.std, float)), log_gain, np.nan)
 
 
 def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposures) -> Diagnosis:

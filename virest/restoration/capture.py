@@ -15,6 +15,7 @@ from virest.capture.frame_coding import FrameCoding
 from virest.capture.imu import ImuSamples
 from virest.capture.join import median_period_s, outside_reason
 from virest.image_formation.row_motion import FrameTranslation, RowMotion, row_motion
+from virest.inference.frame_exposures import OwnExposures
 from virest.inference.unsharp_mask import UnsharpMask, without_mask
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
@@ -245,7 +246,7 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     the movie ends before the lag reaches 0: then the observed ones are used, and all slots keep the remaining lag.
     Frames that were skipped only for the start-up become usable.  Exposures logged in other rows are given back.
     """
-    frames = with_own_exposures(frames, profile.extensions.exposures_late_frames, profile.extensions.exposure_gain)
+    frames = OwnExposures.stated_by(profile).of(frames)
     lagging = profile.extensions.frame_lag_frames
     period_s = median_period_s(np.array([frame.time_s for frame in frames]))
     periods = profile.extensions.frame_lag_s / period_s if period_s > 0 else 0.0
@@ -262,24 +263,6 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     shows = np.arange(len(frames)) + lag - np.searchsorted(used, np.arange(len(frames)), side="right")
     early = [_showing(frame, frames, int(shows[k]), period_s, rest_s) for k, frame in enumerate(frames[: last + 1])]
     return (*early, *frames[last + 1 :])
-
-
-def with_own_exposures(
-    frames: Sequence[Frame], rows_late: int, exposure_gain: Sequence[float] = ()
-) -> tuple[Frame, ...]:
-    """The frames with the exposure times and ISO values logged for the frames ``rows_late`` later; the last ones stay.
-
-    Those before the first or after the last row keep the nearest one.  exposure_gain: factors on the exposure times.
-    """
-    if not rows_late and not exposure_gain:
-        return tuple(frames)
-    sources = np.clip(np.arange(len(frames)) + rows_late, 0, len(frames) - 1)
-    gains = (*exposure_gain, *[1.0] * len(frames))
-    own = ((frames[int(k)], gain) for k, gain in zip(sources, gains, strict=False))
-    return tuple(
-        replace(frame, exposure_s=source.exposure_s and source.exposure_s * gain, iso=source.iso)
-        for frame, (source, gain) in zip(frames, own, strict=True)
-    )
 
 
 def _showing(frame: Frame, frames: Sequence[Frame], capture: int, period_s: float, later_s: float) -> Frame:

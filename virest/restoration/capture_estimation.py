@@ -24,6 +24,7 @@ from virest.image_formation.row_motion import FrameTranslation, frame_times_s
 from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
 from virest.inference.coarse_alignment import MIN_EXPLAINED, STEP_S, align_coarsely
 from virest.inference.doubtful_log import doubts
+from virest.inference.frame_exposures import OwnExposures
 from virest.inference.frame_selection import choose_pairs
 from virest.inference.guide_choice import find_guide
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
@@ -45,7 +46,6 @@ from virest.restoration.capture import (
     RestorationPlan,
     at_true_times,
     moved_over_frame,
-    with_own_exposures,
 )
 from virest.restoration.conflict_plan import (
     MAX_FOCAL_SPREAD,
@@ -87,11 +87,10 @@ def plan_restoration(
     coding: how frames were coded, by frame index, filled in as frames are read; missing: unknown.
     """
     coding = {} if coding is None else coding
-    rows, gain = profile.extensions.exposures_late_frames, profile.extensions.exposure_gain
-    if rows or gain:
-        capture = replace(capture, frames=with_own_exposures(capture.frames, rows, gain))
+    if own := OwnExposures.stated_by(profile):
+        capture = replace(capture, frames=own.of(capture.frames))
         even = profile.with_extensions(exposures_late_frames=0, exposure_gain=())
-        return for_own_exposures(plan_restoration(capture, even, settings, read_gray, coding), rows, gain)
+        return for_own_exposures(plan_restoration(capture, even, settings, read_gray, coding), own)
     lag = None if settings.keep_start_up else find_lag(capture, profile, read_gray)
     if lag is None:
         return _planned(capture, profile, settings, read_gray, coding)

@@ -1,7 +1,7 @@
-"""Plan with frames at the times that their points show: stamps that jitter, and exposure times of other rows.
+"""Plan with frames at the times that their points show: stamps that jitter, and exposure times that are logged wrongly.
 
 Both delay each frame by an amount of its own, in mid-exposure.  The first is a delay per frame; the second follows from
-the logged exposures, so it needs no numbers.  Their likelihoods decide.
+the exposures of other rows or from the frames' brightness, so it needs no numbers.  Their likelihoods decide.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
 from virest.image_formation.row_clock import RowClock
 from virest.inference.frame_delays import FrameDelays, Turns, fit_frame_delays, unexplained_turns
+from virest.inference.frame_exposures import AS_LOGGED, ROWS_LATE, OwnExposures, by_brightness
 from virest.inference.observed_tracks import ObservedTracks, frame_times, observe_tracks
 from virest.inference.tracking import TrackPair
-from virest.restoration.capture import RestorationPlan, with_own_exposures
+from virest.restoration.capture import RestorationPlan
 from virest.restoration.plan_notes import NoteCode
 from virest.restoration.profile_conflict import CONTRADICTED, MOST_LEFT, VALUE_P
 
@@ -29,8 +30,6 @@ log = logging.getLogger(__name__)
 
 POINTS_PER_PAIR = 60
 """Points of a pair that are used: three numbers are fitted to them."""
-ROWS_LATE = (1, -1, 2, -2)
-"""Rows by which a table of exposures may lag (+) or lead (−) the movie."""
 MOST_FRAMES = 3000
 """Frames of a movie that are tracked for delays of their own, the first ones: 3000 of 640×480 take 20 s."""
 SAME_START_S, LEAST_OWN = 1e-4, 0.5
@@ -46,10 +45,10 @@ class FrameTimes:
     """With the exposures that the frames had."""
     profile: CameraProfile
     """The given one, with a delay for each frame."""
-    rows_late: int
-    """Rows by which exposures are logged late."""
     text: str
     """Message about it."""
+    own: OwnExposures = AS_LOGGED
+    """Exposures of the frames, other than the logged ones."""
     most_left: float | None = MOST_LEFT
     """Largest part of the contradiction that may remain; None: any, since times of a few frames hardly change it."""
 
@@ -62,19 +61,13 @@ class FrameTimes:
 
     def noted(self, plan: RestorationPlan) -> RestorationPlan:
         """The plan that was made with these times, for the capture as it was read."""
-        return for_own_exposures(plan, self.rows_late).noted(NoteCode.TRUE_TIMES, self.text)
+        return for_own_exposures(plan, self.own).noted(NoteCode.TRUE_TIMES, self.text)
 
 
-def for_own_exposures(plan: RestorationPlan, rows_late: int, exposure_gain: tuple[float, ...] = ()) -> RestorationPlan:
+def for_own_exposures(plan: RestorationPlan, own: OwnExposures) -> RestorationPlan:
     """A plan that was made with the frames' own exposures, for a capture whose table of them is off."""
-
-    def changed(profile: CameraProfile) -> CameraProfile:
-        ext = profile.extensions
-        rows = ext.exposures_late_frames + rows_late
-        return profile.with_extensions(exposures_late_frames=rows, exposure_gain=exposure_gain or ext.exposure_gain)
-
-    contradicted = None if plan.contradicted is None else changed(plan.contradicted)
-    return replace(plan, profile=changed(plan.profile), contradicted=contradicted)
+    contradicted = None if plan.contradicted is None else own.on(plan.contradicted)
+    return replace(plan, profile=own.on(plan.profile), contradicted=contradicted)
 
 
 def find_frame_times(
@@ -104,22 +97,22 @@ def find_frame_times(
     log.debug("frames' delays of %.2g s (p = %.2g) move points by %.2g px", found.jitter_s, found.p, moved_px)
     if moved_px < np.sqrt(CONTRADICTED**2 - 1) * noise_px:
         return None
-    rows = _rows_late(capture, observed, profile, found)
-    if rows:
-        text = f"exposure times are logged {rows_apart(rows)}: each frame is restored with its own"
-        return FrameTimes(replace(capture, frames=with_own_exposures(capture.frames, rows)), given, rows, text)
     usable = [frame for frame in capture.frames if frame.skip_reason is None]
     wanted = [frame.index for frame in usable[:MOST_FRAMES]]
     if set(wanted) - {n for pair in pairs for n in (pair.first, pair.second)}:
-        more = _turns(observe_tracks(capture, track_all(wanted), profile), capture.imu, profile)
-        found = (fit_frame_delays(more) if more is not None else None) or found
+        observed = observe_tracks(capture, track_all(wanted), profile)
+        turns = _turns(observed, capture.imu, profile)
+        found = (fit_frame_delays(turns) if turns is not None else None) or found
+    if own := _own_exposures(capture, observed, profile, found):
+        text = f"{_described(own)}: each frame is restored with its own"
+        return FrameTimes(replace(capture, frames=own.of(capture.frames)), given, text, own)
     text = (
         f"stamps differ from frame to frame by {1e3 * found.jitter_s:.1f} ms (rms) from the times that points show, "
         "which are used instead"
     )
     text += f" in the first {MOST_FRAMES} frames" if len(usable) > MOST_FRAMES else ""
     # a frame more, which has no delay, since beyond its last knot a field is constant
-    return FrameTimes(capture, _with_delays(given, profile, capture, usable[: MOST_FRAMES + 1], found), 0, text)
+    return FrameTimes(capture, _with_delays(given, profile, capture, usable[: MOST_FRAMES + 1], found), text)
 
 
 def _with_further_delays(
@@ -162,7 +155,15 @@ def _with_further_delays(
     others = [one for one in given.fields if one != field]
     completed = given.with_fields([*others, _delay_field(starts_s, late_s, std_s, capture)])
     text = f"{(~own).sum()} frames that the profile gives no delay of their own get the one that points show"
-    return FrameTimes(capture, completed, 0, text, most_left=None)
+    return FrameTimes(capture, completed, text, most_left=None)
+
+
+def _described(own: OwnExposures) -> str:
+    """What is wrong with the logged exposures, in words."""
+    if own.rows_late:
+        return f"exposure times are logged {rows_apart(own.rows_late)}"
+    shortest, longest = min(own.gain), max(own.gain)
+    return f"exposure times differ from the logged ones as brightness does, by factors {shortest:.2f} to {longest:.2f}"
 
 
 def rows_apart(rows_late: int) -> str:
@@ -178,23 +179,27 @@ def _turns(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) ->
     return unexplained_turns(imu, observed.table(POINTS_PER_PAIR * len(observed.pairs)), profile)
 
 
-def _rows_late(capture: Capture, observed: ObservedTracks, profile: CameraProfile, delays: FrameDelays) -> int:
-    """Rows by which exposures are logged late, if that is likelier than the log by far; else 0.
+def _own_exposures(
+    capture: Capture, observed: ObservedTracks, profile: CameraProfile, delays: FrameDelays
+) -> OwnExposures:
+    """Exposures of other rows, or that follow the brightness, if they are likelier than the logged ones by far.
 
     Of two hypotheses, the wrong one is k times as likely as the right one with a probability of at most 1 / k (Markov's
-    inequality).  Both have delays besides, so that neither needs to explain everything.
+    inequality).  Each has delays besides, so that none needs to explain everything.
     """
-    if len({frame.exposure_s for frame in capture.frames}) < 2:
-        return 0
-    costs: dict[int, float] = {}
-    for rows in ROWS_LATE:
-        moved = replace(capture, frames=with_own_exposures(capture.frames, rows))
-        turns = _turns(replace(observed, exposure_s=frame_times(moved)[1]), capture.imu, profile)
+    exposure_s = [frame.exposure_s for frame in capture.frames]
+    tried = [OwnExposures(rows) for rows in ROWS_LATE] if len(set(exposure_s)) > 1 else []
+    if None not in exposure_s:
+        tried.append(by_brightness(capture.frames, observed.pairs, profile.curve))
+    costs: list[float] = []
+    for own in tried:
+        corrected = replace(capture, frames=own.of(capture.frames))
+        turns = _turns(replace(observed, exposure_s=frame_times(corrected)[1]), capture.imu, profile)
         found = None if turns is None else fit_frame_delays(turns)
-        if found is not None:
-            costs[rows] = found.cost
-    best = min(costs, key=costs.__getitem__, default=0)
-    return best if costs and costs[best] < delays.cost - np.log(len(ROWS_LATE) / VALUE_P) else 0
+        costs.append(np.inf if found is None else found.cost)
+    best = int(np.argmin(costs)) if costs else 0
+    likelier = bool(costs) and costs[best] < delays.cost - np.log(len(tried) / VALUE_P)
+    return tried[best] if likelier else AS_LOGGED
 
 
 def _with_delays(
