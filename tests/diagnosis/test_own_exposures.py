@@ -25,7 +25,6 @@ from virest.diagnosis.findings import (
     Finding,
     HeldOutGain,
     Nominal,
-    ParameterChange,
     Remaining,
 )
 from virest.diagnosis.geometric_evidence import Model, make_evidence
@@ -117,14 +116,12 @@ def _unlogged(gain: np.ndarray, missing: tuple[int, ...] = (), setup: Setup = AL
     pairs = tuple(replace(p, levels=LevelChange(gain[p.second] / gain[p.first])) for p in observed.pairs)
     evidence = make_evidence(camera.imu.between(-0.2, camera.stamp_s[-1] + 0.25), replace(observed, pairs=pairs))
     model = Model(camera.profile.with_curve(kind="linear"), None, ())
-    std = [np.nan if k in missing else 0.01 for k in range(len(gain))]
-    told = [1.0 if k in missing else g for k, g in enumerate(gain.tolist())]
-    change = ParameterChange([1.0] * len(gain), told, std)
-    drift = Finding("gain_drift", {"gain": change}, HeldOutGain("photometric_rms", 9.0, 1.0, 1.0), (), 0.0, "")
+    measured = np.log(gain)
+    measured[list(missing)] = np.nan
     verdict = SimpleNamespace(evidence=evidence, nominal=model, model=model)
     frames = [Frame(k, 0, t, setup.exposure_s, iso=100) for k, t in enumerate(camera.stamp_s.tolist())]
     unmeasured = len(missing) == len(gain)
-    return exposures_of_points(cast(GeometricVerdict, verdict), frames, None if unmeasured else drift, unmeasured)
+    return exposures_of_points(cast(GeometricVerdict, verdict), frames, None if unmeasured else measured, unmeasured)
 
 
 @pytest.mark.parametrize("missing", [(), (5, 6, 20), tuple(range(ALTERNATING.frames))])

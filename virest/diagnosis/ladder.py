@@ -52,6 +52,7 @@ from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.own_exposures import (
     exposures_of_points,
+    measured_log_light,
     rows_late,
     with_late_exposures,
     with_own_exposures_told,
@@ -390,7 +391,10 @@ class DiagnosisSession:
             return OwnExposures(self.exposures_late_frames)
         drift = next((cause for cause in found.causes if cause.name == "gain_drift"), None)
         late = any((field.kind, field.covariates) == ("delay", (TIME,)) for field in found.fields)
-        return exposures_of_points(self.geometric, self.capture.frames, drift, late) if late or drift else None
+        if not late and not drift:
+            return None
+        measured = measured_log_light(self.light, drift, len(self.capture.frames))
+        return exposures_of_points(self.geometric, self.capture.frames, measured, late)
 
     def conclude(self) -> Diagnosis:
         """The diagnosis, assembled from all stages."""

@@ -28,10 +28,12 @@ from virest.diagnosis.findings import (
     FieldFinding,
     Finding,
     HeldOutGain,
-    ParameterChange,
 )
 from virest.diagnosis.geometric_evidence import Evidence, Model
 from virest.diagnosis.geometric_verdict import GeometricVerdict
+from virest.diagnosis.photometry_effects import GainDrift
+from virest.diagnosis.photometry_fit import fit_photometry
+from virest.diagnosis.picture_ladder import PictureVerdict
 from virest.diagnosis.selection import WORD_LEVELS
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import RowClock
@@ -95,12 +97,13 @@ def with_late_exposures(finding: FieldFinding, rows: int) -> FieldFinding:
 
 
 def exposures_of_points(
-    geometric: GeometricVerdict, frames: Sequence[Frame], drift: Finding | None, delays: bool
+    geometric: GeometricVerdict, frames: Sequence[Frame], measured: Array | None, delays: bool
 ) -> OwnExposures | None:
     """Exposures with which the points agree better than with the logged ones: of other rows, or as brightness changes.
 
-    frames: all of the movie, by index.  drift: gains of the frames' light, up to a factor.  delays: whether frames are
-    late by times of their own, which rows of a table may explain.
+    frames: all of the movie, by index.  measured: log light of the frames over the logged one, up to a constant, NaN if
+    unknown; None: that of tracked frames.  delays: whether frames are late by times of their own, which rows of a table
+    may explain.
 
     A frame whose exposure time changes unlogged is brighter or darker, and its points are seen earlier or later, by
     half of the change where stamps mark its start.  Points are compared with the model at the ladder's end, and with
@@ -116,11 +119,10 @@ def exposures_of_points(
         moved = (np.clip(np.arange(len(frames)) + rows, 0, len(frames) - 1) for rows in ROWS_LATE)
         tried += [(rows, exposure_s[m] / exposure_s) for rows, m in zip(ROWS_LATE, moved, strict=True)]
     pairs, curve = evidence.observed.pairs, geometric.model.profile.curve
-    if drift is not None:
-        measured = _measured_log_light(drift.parameters["gain"])
-        tried.append((0, np.exp(np.nan_to_num(unlogged_log_light(frames, pairs, curve, measured)))))
-    elif delays:
+    if measured is None:
         tried.append((0, np.array(by_brightness(frames, pairs, curve).gain)))
+    else:
+        tried.append((0, np.exp(np.nan_to_num(unlogged_log_light(frames, pairs, curve, measured)))))
     models = geometric.nominal, _with_terms(geometric.nominal, *CLOCKS), geometric.model
     found = []
     for model in (_with_terms(model, "exposure_time") for model in models):
@@ -169,10 +171,24 @@ def _compared_exposures(
     return tuple((longer * gain).tolist()), chance_of(before - after)
 
 
-def _measured_log_light(gain: ParameterChange) -> Array:
-    """Log gains (frames,) over the given ones; NaN: not measured."""
-    log_gain = np.log(np.array(gain.estimate, float) / np.array(gain.nominal, float))
-    return np.where(np.isfinite(np.array(gain.std, float)), log_gain, np.nan)
+def measured_log_light(light: PictureVerdict, drift: Finding | None, movie_frames: int) -> Array | None:
+    """Log light (frames,) of a movie's frames over the logged one, from its patches; NaN: not measured.
+
+    drift: gains that were found.  Without them they are fitted: exposure × ISO that alternates while the light does not
+    is no gain for certain, since an encoder that lags would show the same.  None: too few patches.
+    """
+    if drift is not None:
+        gain = drift.parameters["gain"]
+        log_gain = np.log(np.array(gain.estimate, float) / np.array(gain.nominal, float))
+        return np.where(np.isfinite(np.array(gain.std, float)), log_gain, np.nan)
+    if light.observations is None or not light.observations.product_known:
+        return None
+    gains = GainDrift(tuple(light.observations.frames.tolist()), movie_frames)
+    fitted = fit_photometry(light.observations, light.profile, [gains])
+    seen = gains.seen_in(light.observations).frames
+    log_light = np.full(movie_frames, np.nan)
+    log_light[list(seen)] = fitted.values - np.log(light.profile.extensions.gain_of(seen))
+    return log_light
 
 
 def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposures) -> Diagnosis:
