@@ -109,7 +109,7 @@ def test_the_true_profile_leaves_only_noise(rng: np.random.Generator) -> None:
     assert np.std(residuals(made_observations(true, rng, 0.3), NOMINAL)) > 4 * NOISE
 
 
-def test_a_shadow_on_one_side_is_a_field_of_gain(rng: np.random.Generator) -> None:
+def test_a_shadow_on_one_side_is_a_field_of_gain(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """The map is recovered beside a vignette in the profile; without the shadow there is none.
 
     If all patches move alike, an even slope equals a gain per frame: only the curvature of the map is determined.
@@ -132,6 +132,9 @@ def test_a_shadow_on_one_side_is_a_field_of_gain(rng: np.random.Generator) -> No
     assert np.abs(bend).max() < 0.03
     assert found.held_out.gain > 0.8
     assert light_field(replace(observed, grey=grey), with_light_field(profile, found)) is None
+    worse = HeldOutGain(PHOTOMETRY, 0.71, 0.72, 0.6)
+    monkeypatch.setattr("virest.diagnosis.field.brightness._held_out", lambda *_: worse)
+    assert light_field(replace(observed, grey=grey), profile) is None  # it predicts other patches worse
 
 
 def test_stationary_flicker_is_replaced_by_a_shadow(rng: np.random.Generator) -> None:

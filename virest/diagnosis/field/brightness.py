@@ -124,7 +124,8 @@ def light_field(observations: PhotometricObservations, profile: CameraProfile, g
             continue
         for count in forms[one.index]:
             found = _fitted(seen, profile, at, tangent, weight, block, count, one.p_value)
-            if best is None or found.held_out.after < FINER_LEFT * best.held_out.after:
+            most_left = found.held_out.before if best is None else FINER_LEFT * best.held_out.after
+            if found.held_out.after < most_left:
                 best = found
     return best
 
