@@ -42,7 +42,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def planned(capture: Capture, profile: CameraProfile | None = None) -> RestorationPlan:
     """The plan of ``process --deblur none``, which needs no statistics of blur."""
     read = partial(read_decodable_gray, capture.movie, probe_movie(capture.movie))
-    return plan_restoration(capture, profile or resolve_profile(capture)[0], replace(PRESETS["fast"], deblur="none"), read)
+    settings = replace(PRESETS["fast"], deblur="none")
+    return plan_restoration(capture, profile or resolve_profile(capture)[0], settings, read)
 
 
 def said(plan: RestorationPlan) -> list[str]:

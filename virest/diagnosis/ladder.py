@@ -22,7 +22,6 @@ from virest.diagnosis.ambiguities import (
     offset_beside_averaging,
 )
 from virest.diagnosis.edge_overshoot import judge_sharpening
-from virest.diagnosis.field.blur import blur_field
 from virest.diagnosis.field.bridging import LEAST_PAIRS_LEFT, doubtful_pairs
 from virest.diagnosis.field.brightness import (
     instead_of_flicker,
@@ -33,6 +32,7 @@ from virest.diagnosis.field.brightness import (
     without_gain,
 )
 from virest.diagnosis.field.contradicted import known_stretches
+from virest.diagnosis.field.focus import blur_fields
 from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
@@ -419,8 +419,9 @@ class DiagnosisSession:
                 light = replace(light, profile=with_light_field(light.profile, found))
         if self.blur.edges is not None:
             trajectory = integrate_gyro(self.capture.imu, extended)
-            if (soft := blur_field(self.blur.edges, extended, trajectory, self.capture)) is not None:
-                fields, extended = [*fields, soft[0]], soft[1]
+            soft, extended = blur_fields(self.blur.edges, extended, trajectory, self.capture, self.blur.moving)
+            fields = [*fields, *soft]
+            if soft:
                 uniform_px = (
                     extended.extensions.defocus_sigma_px - self.first.nominal.profile.extensions.defocus_sigma_px
                 )

@@ -12,7 +12,7 @@ damps the ratios (DAMPING, known to DAMPING_STD).  Both were measured on movies 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 
@@ -39,10 +39,12 @@ from virest.image_formation.light import defocus_px
 from virest.inference.edges import EdgeSettings, find_edges
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
+from virest.inference.spectral_limit import widest_gaussian_px
 from virest.inference.time_blocks import even_blocks
 from virest.motion.trajectory import Trajectory
 
 Stream = Iterable[tuple[int, NDArray[np.uint8] | None]]
+Reader = Callable[[Sequence[int]], Stream]
 
 LENS_SIGMA_PX = 0.70
 """Width of a sharp edge in a decoded frame, from lens, pixel and coding; defocus is the excess."""
@@ -72,6 +74,8 @@ MIN_RATIOS = 400
 """Fewest measured bins from which an exposure is estimated."""
 MIN_CONTRAST = 0.06
 """Minimum rms of the predicted log ratios: frames with equal motion do not determine the exposure."""
+SHARPEST_FRAMES = 0.1
+"""Part of the frames that may show more detail than a blur of all frames leaves: noise and coding of single ones."""
 BLOCKS = 8
 """Number of time blocks; measurements within a block share errors."""
 
@@ -88,6 +92,8 @@ class BlurObservations:
     """Bit rate of the movie."""
     steps: IsolatedSteps | None = None
     """Isolated steps of the same frames, in grey levels; None: not measured."""
+    widest_px: tuple[float, ...] = ()
+    """Widest Gaussian blur that the spectrum of each frame allows, px."""
 
     def __len__(self) -> int:
         return len(self.edges) + int(self.valid.sum())
@@ -118,6 +124,10 @@ class BlurObservations:
         """Relative standard deviation of what survives coding."""
         return float(np.hypot(DAMPING_STD, 3.0 * (1.0 - self.surviving) * STARVED_STD))
 
+    def allow(self, gaussian_px: float) -> bool:
+        """Whether a Gaussian blur of all frames leaves as little detail as nine of ten frames show."""
+        return not self.widest_px or gaussian_px <= float(np.quantile(self.widest_px, SHARPEST_FRAMES))
+
     @property
     def edges_determined(self) -> bool:
         """Whether the scene has enough isolated steps to distinguish a defocused image from smooth content."""
@@ -133,7 +143,7 @@ def frames_to_read(capture: Capture, pairs: int = 22) -> list[int]:
 
 
 def look_for_blur(
-    gray: Callable[[Sequence[int]], Stream],
+    gray: Reader,
     capture: Capture,
     profile: CameraProfile,
     trajectory: Trajectory,
@@ -149,14 +159,15 @@ def look_for_blur(
     early = [[k for k in wanted if part[0] - PAIR_FRAMES <= k < part[0]] if part else [] for part in parts]
     calls = [(gray, [*lead, *part], len(lead), capture.frames, curve) for lead, part in zip(early, parts, strict=True)]
     seen = each(_measured, calls)
-    edges, pairs, steps = ([one for part in seen for one in part[kind]] for kind in range(3))
+    edges: list[EdgeWidths] = [one for part in seen for one in part[0]]
+    pairs: list[SpectrumRatios] = [one for part in seen for one in part[1]]
+    steps: list[IsolatedSteps] = [one for part in seen for one in part[2]]
+    widest_px = tuple(one for part in seen for one in part[3])
     found = _chosen(join_edges(edges), join_ratios(pairs), profile, trajectory, capture.bits_per_px)
-    return replace(found, steps=join_steps(steps))
+    return replace(found, steps=join_steps(steps), widest_px=widest_px)
 
 
-def look_for_steps(
-    gray: Callable[[Sequence[int]], Stream], capture: Capture, each: ParallelMap = one_by_one
-) -> IsolatedSteps:
+def look_for_steps(gray: Reader, capture: Capture, each: ParallelMap = one_by_one) -> IsolatedSteps:
     """The isolated steps in the frames of :func:`frames_to_read`, as :func:`look_for_blur` finds them."""
     parts = _parts(frames_to_read(capture))
     seen = each(_steps_of_part, [(gray, part, capture.frames) for part in parts])
@@ -167,9 +178,7 @@ def _parts(wanted: Sequence[int]) -> list[list[int]]:
     return [part.tolist() for part in np.array_split(np.array(wanted, np.intp), PARTS)]
 
 
-def _steps_of_part(
-    gray: Callable[[Sequence[int]], Stream], wanted: list[int], frames: Sequence[Frame]
-) -> list[IsolatedSteps]:
+def _steps_of_part(gray: Reader, wanted: list[int], frames: Sequence[Frame]) -> list[IsolatedSteps]:
     return [
         isolated_steps(picture, frames[index], *find_edges(picture, EdgeSettings()))
         for index, picture in gray(wanted)
@@ -178,29 +187,38 @@ def _steps_of_part(
 
 
 def _measured(
-    gray: Callable[[Sequence[int]], Stream], wanted: list[int], lead: int, frames: Sequence[Frame], curve: ResponseCurve
-) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps]]:
-    """Edges, spectrum ratios and steps of frames in ascending order; the first ``lead`` only serve as first of a pair.
+    gray: Reader, wanted: list[int], lead: int, frames: Sequence[Frame], curve: ResponseCurve
+) -> tuple[list[EdgeWidths], list[SpectrumRatios], list[IsolatedSteps], list[float]]:
+    """Edges, spectrum ratios, steps and widest blurs of frames in ascending order.
 
-    At most PAIR_FRAMES + 1 frames are in memory.
+    The first ``lead`` frames only serve as first of a pair.  At most PAIR_FRAMES + 1 frames are in memory.
     """
     only_paired = frozenset(wanted[:lead])
     edges: list[EdgeWidths] = []
     steps: list[IsolatedSteps] = []
     pairs: list[SpectrumRatios] = []
+    widest_px: list[float] = []
     kept: dict[int, SeenFrame] = {}
-    for index, picture in gray(wanted):
-        if picture is None or not frames[index].exposure_s:
-            continue
+    for seen in pictures_of(gray, wanted, frames):
+        picture, frame = seen.picture, seen.recent[0]
+        index = frame.index
         if index not in only_paired:
             found = find_edges(picture, EdgeSettings())
-            edges.append(observe_picture(picture, frames[index], curve, *found))
-            steps.append(isolated_steps(picture, frames[index], *found))
-        kept[index] = SeenFrame(picture, _recent(frames, index))
+            edges.append(observe_picture(picture, frame, curve, *found))
+            steps.append(isolated_steps(picture, frame, *found))
+            widest_px.append(widest_gaussian_px(picture, curve))
+        kept[index] = seen
         if index - PAIR_FRAMES in kept and index not in only_paired:
             pairs.append(observe_pair(kept[index - PAIR_FRAMES], kept[index], curve))
         kept = {k: seen for k, seen in kept.items() if k > index - PAIR_FRAMES}
-    return edges, pairs, steps
+    return edges, pairs, steps, widest_px
+
+
+def pictures_of(gray: Reader, wanted: Sequence[int], frames: Sequence[Frame]) -> Iterator[SeenFrame]:
+    """The pictures of frames with a known exposure, in order."""
+    for index, picture in gray(wanted):
+        if picture is not None and frames[index].exposure_s:
+            yield SeenFrame(picture, _recent(frames, index))
 
 
 def _recent(frames: Sequence[Frame], index: int) -> tuple[Frame, ...]:
@@ -258,6 +276,19 @@ def residuals(
     widths = fitted_width(predicted.motion_px, defocus_px(profile, observations.edges.points_px), lens_sigma_px)
     off = _ratio_residuals(observations, predicted.log_ratios, damping)
     return np.concatenate([observations.edges.width_px - widths, off])
+
+
+def added_variance(
+    observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory
+) -> tuple[Index, Array]:
+    """(tile (n,) of each measured bin, variance, px², of the second frame's blur less the first's beside the path's).
+
+    A log ratio changes by (2π f)² per px², and a residual in px by half of that at τ = 1 px.
+    """
+    predicted = predicted_ratios(observations.ratios, profile, trajectory)[observations.valid]
+    tile, which = np.nonzero(observations.valid)
+    share = observations.surviving * np.array(DAMPING)[ring_of_bin()[which]]
+    return tile, 2 * _ratio_residuals(observations, predicted, 1.0) / share
 
 
 def _ratio_residuals(observations: BlurObservations, log_ratios: Array, damping: float) -> Array:

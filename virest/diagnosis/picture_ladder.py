@@ -24,7 +24,8 @@ from virest.diagnosis.curve_from_blur import (
     judge_mixing,
     observe_mixing,
 )
-from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
+from virest.diagnosis.field.focus import moving_focus
+from virest.diagnosis.findings import BLUR, PHOTOMETRY, FieldFinding, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.isolated_steps import IsolatedSteps
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import (
@@ -67,6 +68,8 @@ UNEVEN = (
     "brightness changes from frame to frame, unevenly across the frame: a moving shadow "
     "or light from one side; no cause was named for it"
 )
+SURE = 2.0
+"""Standard deviations by which a defocus must exceed what the frames' spectra allow, to be refused."""
 SOFT_Z = 5.0
 """Above this many σ, note a possible defocus; as a cause it must be more significant, since lenses vary."""
 
@@ -96,6 +99,8 @@ class PictureVerdict:
     blur_rms_px: float | None = None
     edges: local_blur.BlurObservations | None = None
     """The measured local blur."""
+    moving: FieldFinding | None = None
+    """Blur over time that spectra show."""
     steps: IsolatedSteps | None = None
     """Isolated steps of the frames in which blur was measured; None: not measured."""
     notes: list[str] = field(default_factory=list)
@@ -419,7 +424,13 @@ def climb_blur(
         if fitted.determined[k] and ((k == 0 and is_exposure) or found[k].is_named(effect.name))
     ]
     defocus = found[1].parameter
-    if 1 not in named and fitted.determined[1] and defocus.estimate - defocus.nominal > SOFT_Z * defocus.std:
+    if 1 in named and not observations.allow(defocus.estimate - SURE * defocus.std):
+        named.remove(1)
+        verdict.notes.append(
+            f"edges are blurred by {defocus.estimate:.2f} px, but frames show finer detail than such a blur leaves: "
+            "the scene's edges are soft, or the focus moves; no defocus is named"
+        )
+    elif 1 not in named and fitted.determined[1] and defocus.estimate - defocus.nominal > SOFT_Z * defocus.std:
         soft = float(np.hypot(defocus.estimate, fitted.nuisance[0]))
         verdict.notes.append(
             f"edges are blurred by {soft:.2f} px: a soft lens, or a defocus of about {defocus.estimate:.1f} px; "
@@ -434,6 +445,7 @@ def climb_blur(
             verdict.findings.append(Finding(name, changes, held, (), p_value, sentence_of(name, changes)))
             verdict.rungs.append(Rung(name, {name: held.after}, held.before, BLUR))
             verdict.profile = effects[k].apply(verdict.profile, np.array([change.estimate]))
+    verdict.moving = moving_focus(gray, observations, verdict.profile, trajectory, capture)
     return verdict, is_exposure
 
 

@@ -26,6 +26,11 @@ def chi2_below(probability: float, freedom: int) -> float:
     return 2.0 * float(special.gammaincinv(freedom / 2, probability))
 
 
+def ratio_tail(value: Any, freedom: Any, freedom_below: Any) -> float:
+    """Probability of a larger ratio of two mean squares (Fisher's F)."""
+    return float(special.fdtrc(freedom, freedom_below, value))
+
+
 def gamma_tail(value: float, shape: float, scale: float) -> float:
     """Probability of a larger value of a gamma distribution."""
     return float(special.gammaincc(shape, value / scale))

@@ -198,7 +198,7 @@ def blur_field(
     field = Field("blur", (form.covariate,), (tuple(form.knots.tolist()),), rows[0], rows[1], stamp, form.logged)
     others = {other.covariate for one, other in found if _indistinguishable(scored, one)} - {form.covariate}
     rivals = tuple(f"blur over {name}" for name in sorted(others))
-    return _finding(field, held, scored.p_value, rivals), _with_field(profile, field, lowest)
+    return blur_finding(field, held, scored.p_value, rivals), _with_field(profile, field, lowest)
 
 
 def _significant_score(edges: _Edges, form: _Form, forms: int) -> Scored | None:
@@ -283,14 +283,16 @@ def _with_field(profile: CameraProfile, field: Field, lowest: float) -> CameraPr
     )
 
 
-def _finding(field: Field, held: HeldOutGain, p_value: float, rivals: tuple[str, ...]) -> FieldFinding:
+def blur_finding(
+    field: Field, held: HeldOutGain, p_value: float, rivals: tuple[str, ...], of: str = "edges"
+) -> FieldFinding:
     """The finding in words."""
     (name,), values = field.covariates, np.array(field.values)[:, 0]
     along = np.linspace(field.knots[0][0], field.knots[0][-1], SAMPLES)
     shape = curve_shape(field.at(along)[:, 0], name)
     largest = int(np.argmax(values))
     size = float(values[largest])
-    rms = f"edges {held.before:.3g} px → {held.after:.3g} px, held out"
+    rms = f"{of} {held.before:.3g} px → {held.after:.3g} px, held out"
     return FieldFinding(
         (name,), "blur", shape, f"{SENTENCES[name].format(size=f'{size:.2g}', shape=shape)} ({rms})", size, "px",
         field.std[largest][0], held, p_value, rivals, None, REASONS[name], NEXT[name], (field,),

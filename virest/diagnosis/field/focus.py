@@ -1,0 +1,232 @@
+"""A focus that moves, from the spectra of the same patches in two frames.
+
+Two frames with Gaussian blurs of variance u and v, px², differ in the log of their power by 4π² f² (v − u) beside what
+their motion predicts.  A scene of soft edges is the same in both frames and cancels.  Frames a tenth of a second apart
+are compared with near and far ones, so that their differences determine the variance over time up to a constant, which
+is that of the sharpest frames.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from virest.arrays import Array, Mask
+from virest.camera.field import Field
+from virest.camera.profile import CameraProfile
+from virest.capture.join import median_period_s
+from virest.capture.records import Capture
+from virest.diagnosis.field.blur import MIN_GAIN, MIN_SIZE_PX, blur_field, blur_finding
+from virest.diagnosis.field.screening import MAX_P
+from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
+from virest.diagnosis.local_blur import (
+    LENS_SIGMA_PX,
+    LENS_STD_PX,
+    BlurObservations,
+    Reader,
+    added_variance,
+    pictures_of,
+    predicted_blur,
+)
+from virest.diagnosis.local_blur_model import fitted_width
+from virest.diagnosis.local_blur_spectra import SeenFrame, SpectrumRatios, join_ratios, observe_pair
+from virest.inference.chance import chi2_tail, ratio_tail
+from virest.inference.robust import robust_std
+from virest.motion.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
+
+CODING_PX2 = 2 * LENS_SIGMA_PX * LENS_STD_PX
+"""Standard deviation, px², of a frame's blur by coding alone."""
+LEAST_TILES, LEAST_BINS = 5, 4
+"""Fewest tiles of a pair, and bins of a tile."""
+STEP_S, MOST_TIMES = 0.1, 100
+"""Spacing of the compared frames: a focus motor takes 0.1 to 0.5 s for a move; and their largest number."""
+APART = 1, 3, 9
+"""Distances of compared frames, in steps: near pairs follow the motion, far ones keep errors from adding up."""
+NARROWEST = 0.2
+"""Part of the edges that may be narrower than the blur of the sharpest frames, by noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Differences of the frames' blur in pairs of frames."""
+
+    times_s: Array
+    """(n, 2) timestamps, camera clock."""
+    change_px2: Array
+    """(n,) variance of the second frame's blur less that of the first."""
+    std_px2: Array
+    """(n,) its standard deviation."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Tiles:
+    """The same in each tile of the picture."""
+
+    times_s: Array
+    x_px: Array
+    change_px2: Array
+
+    def pairs(self, use: Mask | slice = slice(None)) -> _Pairs:
+        """Medians over the tiles of each pair of frames."""
+        times_s, pair = np.unique(self.times_s[use], axis=0, return_inverse=True)
+        change = self.change_px2[use]
+        parts = [change[pair.ravel() == k] for k in range(len(times_s))]
+        enough = np.array([len(part) >= LEAST_TILES for part in parts], bool)
+        parts = [part for part, yes in zip(parts, enough, strict=True) if yes]
+        scatter = np.median([robust_std(part) for part in parts]) if parts else 0.0
+        std = np.hypot(scatter / np.sqrt([len(part) for part in parts]), np.sqrt(2) * CODING_PX2)
+        return _Pairs(times_s[enough], np.array([np.median(part) for part in parts]), np.asarray(std, float))
+
+
+@dataclass(frozen=True, slots=True)
+class _OverTime:
+    """Variances of the frames' blur, fitted to pairs."""
+
+    times_s: Array
+    variance_px2: Array
+    """(k,) up to a constant."""
+    std_px2: Array
+    p_value: float
+    """Probability of such differences without any change."""
+
+    def changes(self, pairs: _Pairs) -> Array:
+        """Change (n,) in each pair."""
+        at = np.interp(pairs.times_s, self.times_s, self.variance_px2)
+        return np.asarray(at[:, 1] - at[:, 0])
+
+
+def blur_fields(
+    seen: BlurObservations,
+    profile: CameraProfile,
+    trajectory: Trajectory,
+    capture: Capture,
+    moving: FieldFinding | None = None,
+) -> tuple[list[FieldFinding], CameraProfile]:
+    """All blur fields that edges and spectra support, and the profile with them.
+
+    moving: that of :func:`moving_focus`.  It takes precedence over a blur of the edges over time, and a logged focus
+    distance over both.
+    """
+    by_edges = blur_field(seen, profile, trajectory, capture)
+    covariates = () if by_edges is None else by_edges[0].covariates
+    found, own = ([], profile) if by_edges is None else ([by_edges[0]], by_edges[1])
+    if moving is None or covariates == ("focus",):
+        return found, own
+    if covariates == ("time",):
+        found, own = [], profile
+    (field,) = moving.fields
+    own = own.with_extensions(defocus_sigma_px=_even_px(seen, profile, trajectory, field))
+    return [*found, moving], own.with_fields([*own.fields, field])
+
+
+def _even_px(seen: BlurObservations, profile: CameraProfile, trajectory: Trajectory, field: Field) -> float:
+    """Defocus of the sharpest frames: that of the narrowest edges, since soft content is wider; 0 if none was found."""
+    edges = seen.edges
+    if not profile.extensions.defocus_sigma_px or not len(edges):
+        return 0.0
+    motion_px = predicted_blur(seen, profile, trajectory).motion_px
+    moved_px = field.at_time(edges.stamp_s)[:, 0]
+    left = edges.width_px**2 - fitted_width(motion_px, moved_px, LENS_SIGMA_PX) ** 2
+    even_px = float(np.sqrt(max(np.quantile(left, NARROWEST), 0.0)))
+    return even_px if even_px > MIN_SIZE_PX and seen.allow(even_px) else 0.0
+
+
+def moving_focus(
+    gray: Reader, seen: BlurObservations, profile: CameraProfile, trajectory: Trajectory, capture: Capture
+) -> FieldFinding | None:
+    """The blur over time that spectra of frames support; None where they support none, or the capture is too long.
+
+    Further frames are read only if the pairs that were measured for the exposure differ.
+    """
+    first = _tiles(seen, profile, trajectory).pairs()
+    squares = float(np.sum((first.change_px2 / first.std_px2) ** 2))
+    if not len(first.change_px2) or profile.over_time("blur") or chi2_tail(squares, len(first.change_px2)) > MAX_P:
+        return None
+    wanted = _frames(capture)
+    if len(wanted) > MOST_TIMES:
+        return None
+    ratios = _compared(gray, wanted, capture, profile)
+    tiles = _tiles(replace(seen, ratios=ratios), profile, trajectory)
+    found = _fitted(tiles.pairs())
+    if found is None or found.p_value > MAX_P:
+        return None
+    lowest = np.argmin(found.variance_px2)
+    alike = found.variance_px2 - found.variance_px2[lowest] < 2 * np.hypot(found.std_px2, found.std_px2[lowest])
+    variance = np.maximum(found.variance_px2 - found.variance_px2[alike].mean(), 0.0)
+    sigma = np.sqrt(np.where(variance < MIN_SIZE_PX**2, 0.0, variance))
+    log.debug("focus over time: p %.2g, blur up to %.2f px", found.p_value, sigma.max())
+    held_out = _held_out(tiles)
+    if not sigma.any() or held_out is None or held_out.after > (1 - MIN_GAIN) * held_out.before:
+        return None
+    std = found.std_px2 / (2 * np.maximum(sigma, MIN_SIZE_PX))
+    values, deviations = (tuple((float(value),) for value in column) for column in (sigma, std))
+    field = Field("blur", ("time",), (tuple(found.times_s.tolist()),), values, deviations, capture.stamp_0_ns)
+    return blur_finding(field, held_out, found.p_value, (), "frames")
+
+
+def _frames(capture: Capture) -> list[int]:
+    """Movie indices of the frames to compare."""
+    usable = [f for f in capture.frames if f.exposure_s and (f.skip_reason is None or f.only_startup)]
+    period_s = median_period_s(np.array([frame.time_s for frame in usable]))
+    return [frame.index for frame in usable][:: max(round(STEP_S / period_s), 1) if period_s > 0 else 1]
+
+
+def _compared(gray: Reader, wanted: Sequence[int], capture: Capture, profile: CameraProfile) -> SpectrumRatios:
+    """Spectrum ratios of frames with those before them."""
+    kept: deque[SeenFrame] = deque(maxlen=APART[-1])
+    pairs = []
+    for frame in pictures_of(gray, wanted, capture.frames):
+        pairs += [observe_pair(kept[-apart], frame, profile.curve) for apart in APART if apart <= len(kept)]
+        kept.append(frame)
+    return join_ratios(pairs)
+
+
+def _tiles(seen: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> _Tiles:
+    """The change of the blur in each tile with enough bins."""
+    which, change = added_variance(seen, profile, trajectory)
+    tile, begin, count = np.unique(which, return_index=True, return_counts=True)
+    parts = [change[b : b + n] for b, n in zip(begin, count, strict=True) if n >= LEAST_BINS]
+    tile = tile[count >= LEAST_BINS]
+    medians = np.array([np.median(part) for part in parts])
+    return _Tiles(seen.ratios.stamp_s[tile, :, 0], seen.ratios.points_px[tile, 0, 0], medians)
+
+
+def _fitted(pairs: _Pairs) -> _OverTime | None:
+    """Variances of all compared frames by least squares; errors beyond the stated ones count as noise in an F test."""
+    times_s, which = np.unique(pairs.times_s, return_inverse=True)
+    which = which.reshape(-1, 2)
+    numbers, freedom = len(times_s) - 1, len(which) - len(times_s) + 1
+    if numbers < 1 or freedom < 1:
+        return None
+    unit = np.eye(len(times_s))
+    rows, target = (unit[which[:, 1]] - unit[which[:, 0]]) / pairs.std_px2[:, None], pairs.change_px2 / pairs.std_px2
+    # the mean is open, and frames that nothing connects stay near it
+    inverse = np.linalg.inv(rows.T @ rows + unit / (MIN_SIZE_PX**2 * len(times_s)) ** 2)
+    variance = inverse @ (rows.T @ target)
+    left = target - rows @ variance
+    excess = max(float(left @ left) / freedom, 1.0)
+    ratio = max(float(target @ target - left @ left), 0.0) / numbers / excess
+    centred = np.eye(len(times_s)) - 1 / len(times_s)
+    std = np.sqrt(excess * np.diag(centred @ inverse @ centred))
+    return _OverTime(times_s, np.asarray(variance), std, ratio_tail(ratio, numbers, freedom))
+
+
+def _held_out(tiles: _Tiles) -> HeldOutGain | None:
+    """Rms over pairs, px at a blur of 1 px, of what one half of the picture shows beside a fit to the other half."""
+    right = tiles.x_px > np.median(tiles.x_px)
+    halves = [tiles.pairs(side) for side in (right, ~right)]
+    folds = []
+    for pairs, judged in (halves, halves[::-1]):
+        found = _fitted(pairs)
+        if found is None or not len(judged.change_px2):
+            return None
+        left = judged.change_px2 - found.changes(judged)
+        before, after = (float(np.sqrt(np.mean(one**2))) / 2 for one in (judged.change_px2, left))
+        folds.append((before, after, 0.0))
+    return replace(HeldOutGain.of_folds(BLUR, folds), noise=None)
