@@ -7,7 +7,7 @@ needs neither edges nor a prior of the scene, only frames with unequal motion.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
@@ -117,10 +117,15 @@ class SeenFrame:
     """Newest first; a frame without known times, or before the movie, is replaced by the next one."""
 
 
-def observe_pair(first: SeenFrame, second: SeenFrame, curve: ResponseCurve) -> SpectrumRatios:
-    """Spectrum ratios of the tiles that can be tracked from one frame to the other."""
+def observe_pair(
+    first: SeenFrame, second: SeenFrame, curve: ResponseCurve, predicted: Callable[[Array], Array] | None = None
+) -> SpectrumRatios:
+    """Spectrum ratios of the tiles that can be tracked from one frame to the other.
+
+    predicted: where points (n, 2) of the first frame are expected in the second; None: near the same place.
+    """
     picture_1, picture_2 = first.picture, second.picture
-    start, moved = _tracked_tiles(picture_1, picture_2)
+    start, moved = _tracked_tiles(picture_1, picture_2, predicted)
     table, slope = curve.linear_table(), curve.slope_table()
     clipped = curve.clipped_table(1.5)
     power_1, grey_1, bad_1 = _tile_powers(picture_1, start, table, clipped)
@@ -150,7 +155,7 @@ def join_ratios(parts: Iterable[SpectrumRatios]) -> SpectrumRatios:
     return SpectrumRatios(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SpectrumRatios)))
 
 
-def _tracked_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
+def _tracked_tiles(first: Picture, second: Picture, predicted: Callable[[Array], Array] | None) -> tuple[Array, Array]:
     """Whole-pixel centres (n, 2) of tiles in both frames, tracked forth and back."""
     height, width = first.shape
     reach = SIDE_PX // 2
@@ -158,8 +163,9 @@ def _tracked_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
         np.arange(reach, width - reach + 1, SPACING_PX), np.arange(reach, height - reach + 1, SPACING_PX)
     )
     start = np.stack([x, y], -1).reshape(-1, 1, 2).astype(np.float32)
-    ahead, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, winSize=(31, 31), maxLevel=4)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, ahead, None, winSize=(31, 31), maxLevel=4)
+    near = start if predicted is None else predicted(start[:, 0].astype(float))[:, None].astype(np.float32)
+    ahead, found = _followed(first, second, start, near)
+    back, returned = _followed(second, first, ahead, start if predicted is not None else ahead)
     moved = np.rint(ahead[:, 0])
     good = (
         (found.ravel() == 1)
@@ -168,6 +174,17 @@ def _tracked_tiles(first: Picture, second: Picture) -> tuple[Array, Array]:
     )
     good &= (moved >= reach).all(axis=1) & (moved[:, 0] <= width - reach) & (moved[:, 1] <= height - reach)
     return start[good, 0].astype(float), moved[good].astype(float)
+
+
+def _followed(
+    first: Picture, second: Picture, points: NDArray[np.float32], near: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Places (n, 1, 2) of points in the second picture, searched from ``near``, and whether each was found."""
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, points, near.copy(), winSize=(31, 31), maxLevel=4, flags=flags
+    )
+    return np.asarray(ahead, np.float32), np.asarray(found, np.uint8)
 
 
 def _tile_powers(

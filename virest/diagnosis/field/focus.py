@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +34,8 @@ from virest.diagnosis.local_blur import (
 )
 from virest.diagnosis.local_blur_model import fitted_width
 from virest.diagnosis.local_blur_spectra import SeenFrame, SpectrumRatios, join_ratios, observe_pair
+from virest.diagnosis.photometry_patches import predicted_points
+from virest.image_formation.turning_camera import turning_camera
 from virest.inference.chance import chi2_tail, ratio_tail
 from virest.inference.robust import robust_std
 from virest.motion.trajectory import Trajectory
@@ -151,7 +153,7 @@ def moving_focus(
     wanted = _frames(capture)
     if len(wanted) > MOST_TIMES:
         return None
-    ratios = _compared(gray, wanted, capture, profile)
+    ratios = _compared(gray, wanted, capture, profile, trajectory)
     tiles = _tiles(replace(seen, ratios=ratios), profile, trajectory)
     found = _fitted(tiles.pairs())
     if found is None or found.p_value > MAX_P:
@@ -177,12 +179,20 @@ def _frames(capture: Capture) -> list[int]:
     return [frame.index for frame in usable][:: max(round(STEP_S / period_s), 1) if period_s > 0 else 1]
 
 
-def _compared(gray: Reader, wanted: Sequence[int], capture: Capture, profile: CameraProfile) -> SpectrumRatios:
+def _compared(
+    gray: Reader, wanted: Sequence[int], capture: Capture, profile: CameraProfile, trajectory: Trajectory
+) -> SpectrumRatios:
     """Spectrum ratios of frames with those before them."""
+    camera = turning_camera(trajectory, profile)
+
+    def expected(first: SeenFrame, second: SeenFrame) -> Callable[[Array], Array]:
+        return lambda points_px: predicted_points(points_px, first.recent[0], second.recent[0], camera)
+
     kept: deque[SeenFrame] = deque(maxlen=APART[-1])
     pairs = []
     for frame in pictures_of(gray, wanted, capture.frames):
-        pairs += [observe_pair(kept[-apart], frame, profile.curve) for apart in APART if apart <= len(kept)]
+        others = [kept[-apart] for apart in APART if apart <= len(kept)]
+        pairs += [observe_pair(other, frame, profile.curve, expected(other, frame)) for other in others]
         kept.append(frame)
     return join_ratios(pairs)
 
