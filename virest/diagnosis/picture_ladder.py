@@ -424,18 +424,9 @@ def climb_blur(
         if fitted.determined[k] and ((k == 0 and is_exposure) or found[k].is_named(effect.name))
     ]
     defocus = found[1].parameter
-    if 1 in named and not observations.allow(defocus.estimate - SURE * defocus.std):
+    refused = 1 in named and not observations.allow(defocus.estimate - SURE * defocus.std)
+    if refused:
         named.remove(1)
-        verdict.notes.append(
-            f"edges are blurred by {defocus.estimate:.2f} px, but frames show finer detail than such a blur leaves: "
-            "the scene's edges are soft, or the focus moves; no defocus is named"
-        )
-    elif 1 not in named and fitted.determined[1] and defocus.estimate - defocus.nominal > SOFT_Z * defocus.std:
-        soft = float(np.hypot(defocus.estimate, fitted.nuisance[0]))
-        verdict.notes.append(
-            f"edges are blurred by {soft:.2f} px: a soft lens, or a defocus of about {defocus.estimate:.1f} px; "
-            "not reported as a cause"
-        )
     if named:
         gains = local_blur_fit.held_out(observations, profile, trajectory, tuple(effects[k] for k in named))
         for k, held in zip(named, gains, strict=True):
@@ -446,7 +437,19 @@ def climb_blur(
             verdict.rungs.append(Rung(name, {name: held.after}, held.before, BLUR))
             verdict.profile = effects[k].apply(verdict.profile, np.array([change.estimate]))
     verdict.moving = moving_focus(gray, observations, verdict.profile, trajectory, capture)
+    if verdict.moving is None and 1 not in named and fitted.determined[1]:
+        verdict.notes += _softness(defocus, float(fitted.nuisance[0]), refused)
     return verdict, is_exposure
+
+
+def _softness(defocus: ParameterChange, lens_px: float, refused: bool) -> list[str]:
+    """A note about soft edges for which no defocus is named; refused: since frames show finer detail."""
+    if not refused and defocus.estimate - defocus.nominal <= SOFT_Z * defocus.std:
+        return []
+    soft = f"edges are blurred by {np.hypot(defocus.estimate, lens_px):.2f} px"
+    if refused:
+        return [f"{soft}, but frames show finer detail than such a blur leaves: the scene has soft edges"]
+    return [f"{soft}: a soft lens, or a defocus of about {defocus.estimate:.1f} px; not reported as a cause"]
 
 
 @dataclass(frozen=True, slots=True)
