@@ -31,6 +31,10 @@ SIGNAL_TO_NOISE = 2.0
 """Least signal over noise of a ring that is compared."""
 
 
+ROUNDING_POWER = (0.375 * SIDE_PX) ** 2 / 12 / 255**2
+"""Power of rounding to 8 bits in a tile under a Hann window."""
+
+
 def widest_gaussian_px(luma: Picture, curve: ResponseCurve) -> float:
     """Upper limit of the standard deviation, px, of a Gaussian blur of the light of a frame; inf: no limit is seen.
 
@@ -38,7 +42,7 @@ def widest_gaussian_px(luma: Picture, curve: ResponseCurve) -> float:
     """
     power = _ring_powers(np.asarray(curve.linear_table()[luma], np.float32))
     frequency = LOWEST_PER_PX + RING_PER_PX * (np.arange(len(power)) + 0.5)
-    noise = power[-2:].mean() * (frequency[-1] / frequency) ** NOISE_SLOPE
+    noise = max(power[-2:].mean(), ROUNDING_POWER) * (frequency[-1] / frequency) ** NOISE_SLOPE
     shown = np.flatnonzero(power - noise > SIGNAL_TO_NOISE * noise)
     log_signal, squared = np.log(power[shown] - noise[shown]), frequency[shown] ** 2
     apart = shown[None, :] - shown[:, None] >= APART
