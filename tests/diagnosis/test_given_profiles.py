@@ -11,7 +11,7 @@ from diagnosis.test_photometry import FRAMES, NOMINAL, hidden, made_observations
 
 from virest.camera.profile import CameraProfile, Extensions
 from virest.camera.shutter import Shutter
-from virest.diagnosis import local_blur, local_blur_fit
+from virest.diagnosis import local_blur, local_blur_fit, picture_ladder
 from virest.diagnosis.ambiguities import as_exposure, exposure_hypothesis
 from virest.diagnosis.findings import GEOMETRY, Finding, HeldOutGain, ParameterChange
 from virest.diagnosis.geometric_findings import with_depth_of
@@ -93,13 +93,16 @@ def test_gains_are_measured_from_those_of_the_profile(rng: np.random.Generator) 
 # ── blur ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def blur_findings(monkeypatch: pytest.MonkeyPatch, given: CameraProfile, scale: float, sigma: float) -> list[Finding]:
-    """Findings for a blur with this exposure scale and defocus."""
+def blur_findings(
+    monkeypatch: pytest.MonkeyPatch, given: CameraProfile, scale: float, sigma: float, widest_px: float = float("inf")
+) -> list[Finding]:
+    """Findings for a blur with this exposure scale and defocus, in frames whose spectra allow ``widest_px``."""
     widths = (np.array([scale]), np.array([sigma]))
     nuisance = np.array([0.6, 0.0])
     found = BlurFit(("", ""), widths, np.diag([0.02**2, 0.05**2]), nuisance, given, 0.1, (True, True))
     judged: list[Any] = []
-    observations = type("Seen", (SimpleNamespace,), {"__len__": lambda _: 500})(steps=None)
+    observations = type("Seen", (SimpleNamespace,), {"__len__": lambda _: 500})(steps=None, allow=widest_px.__ge__)
+    monkeypatch.setattr(picture_ladder, "moving_focus", lambda *_: None)
     monkeypatch.setattr(local_blur, "frames_to_read", lambda _: [1, 2])
     monkeypatch.setattr(local_blur, "look_for_blur", lambda *_: observations)
     monkeypatch.setattr(local_blur_fit, "fit", lambda *_: found)
@@ -107,9 +110,16 @@ def blur_findings(monkeypatch: pytest.MonkeyPatch, given: CameraProfile, scale: 
     gain = HeldOutGain("", 2.0, 1.0, None)
     monkeypatch.setattr(local_blur_fit, "held_out", lambda *a: judged.append(a) or [gain] * len(a[3]))
     verdict, _ = climb_blur(None, given, None, None, None)  # type: ignore[arg-type]
-    assert not verdict.notes
+    assert ("the scene has soft edges" in "".join(verdict.notes)) is (widest_px < sigma - 0.1)
     assert len(judged) == bool(verdict.findings)
     return verdict.findings
+
+
+def test_a_defocus_wider_than_the_spectra_of_frames_allow_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Edges of the scene may be soft; two standard deviations are left to the edges' errors."""
+    given = CameraProfile(64, 48)
+    assert [found.name for found in blur_findings(monkeypatch, given, 1.0, 2.0, 1.95)] == ["defocus"]
+    assert not blur_findings(monkeypatch, given, 1.0, 2.0, 1.5)
 
 
 def blurred(scale: float, sigma: float) -> CameraProfile:

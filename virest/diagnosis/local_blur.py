@@ -39,7 +39,7 @@ from virest.image_formation.light import defocus_px
 from virest.inference.edges import EdgeSettings, find_edges
 from virest.inference.parallel import ParallelMap, one_by_one
 from virest.inference.robust import CAUCHY, cauchy_weight, robust_std
-from virest.inference.spectral_limit import widest_gaussian_px
+from virest.inference.spectral_limit import allow, widest_gaussian_px
 from virest.inference.time_blocks import even_blocks
 from virest.motion.trajectory import Trajectory
 
@@ -74,10 +74,6 @@ MIN_RATIOS = 400
 """Fewest measured bins from which an exposure is estimated."""
 MIN_CONTRAST = 0.06
 """Minimum rms of the predicted log ratios: frames with equal motion do not determine the exposure."""
-SHARPEST_FRAMES, LEAST_BITS = 0.25, 0.25
-"""Part of the frames that may show more detail than a blur of all frames leaves, by noise and coding, and bits per
-pixel from which detail is the picture's.  Limits of 24 captures with a defocus of 1.8 or 3 px (four scenes) were 1.0 to
-1.4 times it and more at 0.25 to 0.5 bit per pixel, and 0.3 to 1.1 times at 0.15."""
 BLOCKS = 8
 """Number of time blocks; measurements within a block share errors."""
 
@@ -127,13 +123,8 @@ class BlurObservations:
         return float(np.hypot(DAMPING_STD, 3.0 * (1.0 - self.surviving) * STARVED_STD))
 
     def allow(self, gaussian_px: float) -> bool:
-        """Whether a Gaussian blur of all frames leaves as little detail as three of four frames show.
-
-        At low bit rates the detail may be the coder's.
-        """
-        if not self.widest_px or self.bits_per_px < LEAST_BITS:
-            return True
-        return gaussian_px <= float(np.quantile(self.widest_px, SHARPEST_FRAMES, method="lower"))
+        """Whether frames show no finer detail than a Gaussian blur of all of them leaves."""
+        return allow(self.widest_px, self.bits_per_px, gaussian_px)
 
     @property
     def edges_determined(self) -> bool:

@@ -28,6 +28,7 @@ from virest.inference.frame_exposures import OwnExposures
 from virest.inference.frame_selection import choose_pairs
 from virest.inference.guide_choice import find_guide
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
+from virest.inference.spectral_limit import allow, widest_gaussian_px
 from virest.inference.synchronisation import (
     AGREEMENT_SLACK_S,
     OffsetEstimate,
@@ -170,8 +171,29 @@ def _planned(
         return plan
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
+    plan = _without_false_defocus(plan, capture, lumas)
     plan = _with_blur_length_check(plan, profile, capture, powers)
     return with_neighbour_survey(plan, capture, surveyed, lumas, coding)
+
+
+def _without_false_defocus(
+    plan: RestorationPlan, capture: Capture, lumas: Mapping[int, NDArray[np.uint8]]
+) -> RestorationPlan:
+    """The plan without a defocus that the frames contradict: undone, it would draw waves beside every edge."""
+    stated_px = plan.profile.extensions.defocus_sigma_px
+    if not stated_px:
+        return plan
+    widest_px = [widest_gaussian_px(luma, plan.profile.curve) for luma in lumas.values()]
+    if allow(widest_px, capture.bits_per_px, stated_px):
+        return plan
+    text = (
+        f"frames show finer detail than the profile's defocus of {stated_px:.2f} px leaves: it is not undone; diagnose "
+        "tells a focus that moves"
+    )
+    profile = plan.profile.with_extensions(defocus_sigma_px=0.0)
+    dropped = set(applied_extensions(plan.profile)) - set(applied_extensions(profile))
+    notes = tuple(note for note in plan.notes if note not in dropped)
+    return replace(plan, profile=profile, notes=notes).noted(NoteCode.FINER_DETAIL, text)
 
 
 # ── translation and depth ────────────────────────────────────────────────────────────────────────────────────────

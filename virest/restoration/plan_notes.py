@@ -25,6 +25,8 @@ class NoteCode(Enum):
     """The focal length, missing in the profile, could not be estimated."""
     BLUR_LENGTH = auto()
     """The frames show blur paths of another length."""
+    FINER_DETAIL = auto()
+    """The frames show detail that the profile's defocus would remove."""
     PROFILE_CONFLICT = auto()
     """Tracked points contradict the profile: the values used instead, or that nothing explains them."""
     DISAGREEMENT = auto()
