@@ -276,17 +276,16 @@ def residuals(
     return np.concatenate([observations.edges.width_px - widths, off])
 
 
-def added_variance(
-    observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory
-) -> tuple[Index, Array]:
-    """(tile (n,) of each measured bin, variance, px², of the second frame's blur less the first's beside the path's).
+def added_variance(observations: BlurObservations, profile: CameraProfile, trajectory: Trajectory) -> Array:
+    """Variance (n, b), px², of the second frame's blur less the first's, beside the path's, in each bin of each tile.
 
-    A log ratio changes by (2π f)² per px², and a residual in px by half of that at τ = 1 px.
+    A log ratio changes by (2π f)² per px², and a residual in px by half of that at τ = 1 px.  NaN: not measured.
     """
     predicted = predicted_ratios(observations.ratios, profile, trajectory)[observations.valid]
-    tile, which = np.nonzero(observations.valid)
-    share = observations.surviving * np.array(DAMPING)[ring_of_bin()[which]]
-    return tile, 2 * _ratio_residuals(observations, predicted, 1.0) / share
+    share = observations.surviving * np.array(DAMPING)[ring_of_bin()]
+    change = np.full(observations.valid.shape, np.nan)
+    change[observations.valid] = 2 * _ratio_residuals(observations, predicted, 1.0)
+    return change / share
 
 
 def _ratio_residuals(observations: BlurObservations, log_ratios: Array, damping: float) -> Array:
