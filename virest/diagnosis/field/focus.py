@@ -177,7 +177,7 @@ def moving_focus(
     sigma = np.sqrt(np.where(variance < MIN_SIZE_PX**2, 0.0, variance))
     as_defocus = _part_as_defocus(tiles)
     log.debug(
-        "focus over time: p %.2g, blur up to %.2f px, %.2f of it as a defocus", found.p_value, sigma.max(), in_all
+        "focus over time: p %.2g, blur up to %.2f px, %.2f of it as a defocus", found.p_value, sigma.max(), as_defocus
     )
     if as_defocus < LEAST_AS_DEFOCUS:
         return None
