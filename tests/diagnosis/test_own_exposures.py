@@ -154,7 +154,7 @@ def test_light_that_changes_is_no_exposure() -> None:
 
 
 def test_unlogged_exposures_are_the_finding_if_they_leave_no_gain() -> None:
-    """One account of delays and gains; a gain that remains shows another cause."""
+    """One account of delays and gains; a gain or delays that remain show another cause."""
     drift = Finding("gain_drift", {}, HeldOutGain("photometric_rms", 9.0, 1.0, 1.0), (), 0.0, "")
     found, given = replace(_judged(1.1, 0.3), causes=(drift,)), _judged(0.31, 0.3)
     found = replace(found, fields=(FieldFinding(
@@ -167,6 +167,7 @@ def test_unlogged_exposures_are_the_finding_if_they_leave_no_gain() -> None:
     assert table.p_value == 1e-6
     assert not told.causes
     assert with_own_exposures_told(found, replace(given, causes=(drift,)), own) is found
+    assert with_own_exposures_told(found, replace(given, fields=found.fields), own) is found
     profile = own.on(CameraProfile(640, 480).with_extensions(exposure_gain=(2.0,)))
     assert profile.extensions.exposure_gain == pytest.approx((1.2, 1.45, 0.6))
     scale = Finding("exposure_time", {}, HeldOutGain("blur_rms_px", 2.0, 1.0, 1.0), (), 0.0, "")

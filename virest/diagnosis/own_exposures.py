@@ -196,17 +196,17 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
 
     A table that is off has no free number besides its rows, and exposures that follow the light have none.  They are
     the better account if they remove as much as a rival of a delay of each frame must.  With other rows, nothing may be
-    left in the points that was not before; with exposures as exact as measured brightness, no gain of the light.
+    left in the points that was not before; with exposures as exact as measured brightness, no gain of the light and no
+    delay of frames.
     """
-    over_time = (field for field in found.fields if (field.kind, field.covariates) == ("delay", (TIME,)))
-    delay = next(over_time, None)
+    delay = _delay_of_frames(found)
     nominal = found.nominal
     held_out = HeldOutGain(GEOMETRY, nominal.geometry_rms_px, _points_left_px(found), nominal.geometry_noise_px)
     held_out = held_out if delay is None else delay.held_out
     gain = replace(held_out, after=_points_left_px(given), noise=given.nominal.geometry_noise_px)
     if (gain.gain or 0.0) < RIVAL_GAIN_FRACTION * (held_out.gain or 0.0):
         return found
-    remains = any(cause.name == "gain_drift" for cause in given.causes)
+    remains = any(cause.name == "gain_drift" for cause in given.causes) or _delay_of_frames(given) is not None
     if remains if own.gain else given.unexplained.significant and not found.unexplained.significant:
         return found
     if own.gain:
@@ -239,6 +239,11 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
         fields=(told, *given.fields),
         residuals={**given.residuals, "before": found.residuals["before"]},
     )
+
+
+def _delay_of_frames(found: Diagnosis) -> FieldFinding | None:
+    over_time = (field for field in found.fields if (field.kind, field.covariates) == ("delay", (TIME,)))
+    return next(over_time, None)
 
 
 def _with_one_scale(own: OwnExposures, given: Diagnosis) -> tuple[OwnExposures, Diagnosis]:
