@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+from diagnosis.test_photometry import FRAMES, NOMINAL, hidden, made_observations
 from motion.synthetic_tracks import Recording, Setup
 from numpy.typing import NDArray
 
@@ -31,10 +32,12 @@ from virest.diagnosis.geometric_evidence import Model, make_evidence
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.own_exposures import (
     exposures_of_points,
+    measured_log_light,
     rows_late,
     with_late_exposures,
     with_own_exposures_told,
 )
+from virest.diagnosis.picture_ladder import PictureVerdict
 from virest.inference.even_light import LevelChange
 from virest.inference.frame_exposures import OwnExposures
 
@@ -134,6 +137,24 @@ def test_exposures_that_change_unlogged_are_told_from_a_gain(missing: tuple[int,
     assert found.p_value is not None
     assert found.p_value < 1e-3
     np.testing.assert_allclose(found.gain, true, rtol=0.06)
+
+
+def test_light_is_measured_whether_or_not_a_gain_was_found(rng: np.random.Generator) -> None:
+    """From the patches, over the gains that were given; frames without patches have none."""
+    gain = 1 + 0.4 * np.sin(np.arange(FRAMES) / 5)
+    observed = made_observations(hidden(gain=tuple(gain.tolist())), rng)
+    observed = observed.subset(observed.frame != 7)
+    given = NOMINAL.with_extensions(gain=(2.0,) * FRAMES)
+    for light in (
+        PictureVerdict(given, observations=observed),
+        PictureVerdict(hidden(gain=tuple(gain.tolist())), observations=observed, nominal=given),
+    ):
+        measured = measured_log_light(light, FRAMES)
+        assert measured is not None
+        assert np.flatnonzero(np.isnan(measured)).tolist() == [7]
+        off = measured - np.log(gain)
+        assert np.nanstd(off) < 0.02
+    assert measured_log_light(PictureVerdict(given), FRAMES) is None
 
 
 def test_no_exposure_is_longer_than_a_frame() -> None:

@@ -212,6 +212,8 @@ class DiagnosisSession:
     """Verdict before the photometric stage."""
     geometric: GeometricVerdict
     light: PictureVerdict
+    light_of_patches: PictureVerdict | None = None
+    """Verdict on brightness before the curve that blur shows."""
     blur: PictureVerdict | None = None
     curve: PictureVerdict | None = None
     edges: PictureVerdict | None = None
@@ -279,7 +281,7 @@ class DiagnosisSession:
             )
             self.geometric = self.points.climbed(progress)
         self.geometric = self._with_flicker_or_bands(progress)
-        self.light = with_exposure_of(self.light, self.geometric.model.profile)
+        self.light = self.light_of_patches = with_exposure_of(self.light, self.geometric.model.profile)
         self.findings = self._of_points(self.points.observed.exposure_s)
 
     def _with_flicker_or_bands(self, progress: Callable[[float], None]) -> GeometricVerdict:
@@ -389,11 +391,11 @@ class DiagnosisSession:
         """Exposures that explain delays or gains of frames which a diagnosis found; None: those logged."""
         if self.exposures_late_frames:
             return OwnExposures(self.exposures_late_frames)
-        drift = next((cause for cause in found.causes if cause.name == "gain_drift"), None)
+        drift = any(cause.name == "gain_drift" for cause in found.causes)
         late = any((field.kind, field.covariates) == ("delay", (TIME,)) for field in found.fields)
         if not late and not drift:
             return None
-        measured = measured_log_light(self.light, drift, len(self.capture.frames))
+        measured = measured_log_light(self.light_of_patches or self.light, len(self.capture.frames))
         return exposures_of_points(self.geometric, self.capture.frames, measured, late)
 
     def conclude(self) -> Diagnosis:

@@ -26,7 +26,6 @@ from virest.diagnosis.findings import (
     UNEXPLAINED,
     Diagnosis,
     FieldFinding,
-    Finding,
     HeldOutGain,
 )
 from virest.diagnosis.geometric_evidence import Evidence, Model
@@ -171,23 +170,20 @@ def _compared_exposures(
     return tuple((longer * gain).tolist()), chance_of(before - after)
 
 
-def measured_log_light(light: PictureVerdict, drift: Finding | None, movie_frames: int) -> Array | None:
+def measured_log_light(light: PictureVerdict, movie_frames: int) -> Array | None:
     """Log light (frames,) of a movie's frames over the logged one, from its patches; NaN: not measured.
 
-    drift: gains that were found.  Without them they are fitted: exposure × ISO that alternates while the light does not
-    is no gain for certain, since an encoder that lags would show the same.  None: too few patches.
+    It is fitted whether or not a gain was found: exposure × ISO that alternates while the light does not is no gain for
+    certain, since an encoder that lags would show the same.  The curve is that of the patches alone, since blur gives a
+    wrong one where exposures are wrong.  None: too few patches.
     """
-    if drift is not None:
-        gain = drift.parameters["gain"]
-        log_gain = np.log(np.array(gain.estimate, float) / np.array(gain.nominal, float))
-        return np.where(np.isfinite(np.array(gain.std, float)), log_gain, np.nan)
     if light.observations is None or not light.observations.product_known:
         return None
     gains = GainDrift(tuple(light.observations.frames.tolist()), movie_frames)
     fitted = fit_photometry(light.observations, light.profile, [gains])
-    seen = gains.seen_in(light.observations).frames
+    seen, given = gains.seen_in(light.observations).frames, light.nominal or light.profile
     log_light = np.full(movie_frames, np.nan)
-    log_light[list(seen)] = fitted.values - np.log(light.profile.extensions.gain_of(seen))
+    log_light[list(seen)] = fitted.values - np.log(given.extensions.gain_of(seen))
     return log_light
 
 
