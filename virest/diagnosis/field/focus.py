@@ -184,7 +184,8 @@ def moving_focus(
     held_out = _held_out(tiles)
     if not sigma.any() or held_out is None or held_out.after > (1 - MIN_GAIN) * held_out.before:
         return None
-    std = found.std_px2 / (2 * np.maximum(sigma, MIN_SIZE_PX))
+    by_coding = 0.5 * seen.damping_std * sigma  # what survives coding scales all differences
+    std = np.hypot(found.std_px2 / (2 * np.maximum(sigma, MIN_SIZE_PX)), by_coding)
     values, deviations = (tuple((float(value),) for value in column) for column in (sigma, std))
     field = Field("blur", ("time",), (tuple(found.times_s.tolist()),), values, deviations, capture.stamp_0_ns)
     return blur_finding(field, held_out, found.p_value, (), "frames")
