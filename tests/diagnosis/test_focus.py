@@ -44,7 +44,7 @@ def found(folder: Path, blur_px: Callable[[float], float] | None, scene: str, de
 
 @pytest.mark.parametrize("scene", ["photographs", "leaves"])
 def test_a_focus_that_hunts_is_a_blur_over_time(tmp_path: Path, scene: str) -> None:
-    """Within 0.25 px in each frame, and no blur is left to the frames in focus, whatever defocus the edges show."""
+    """Within 0.3 px in each frame, and no blur is left to the frames in focus, whatever defocus the edges show."""
     moving, fields, profile = found(tmp_path / "hunts", hunting_px, scene, defocus_px=2.0)
     assert isinstance(moving, FieldFinding)
     assert moving.p_value is not None

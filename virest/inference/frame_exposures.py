@@ -32,7 +32,7 @@ class OwnExposures:
     gain: tuple[float, ...] = ()
     """(frames,) factors on the exposure times by movie index; empty: none."""
     p_value: float | None = None
-    """Probability that the points agree so much better by chance; None: that of the delay that they explain."""
+    """Of the points' better agreement with these exposures; None: the delay of frames that they replace has one."""
 
     def __bool__(self) -> bool:
         return bool(self.rows_late or self.gain)

@@ -141,10 +141,13 @@ def blur_fields(
 
 
 def _even_px(seen: BlurObservations, profile: CameraProfile, trajectory: Trajectory, field: Field) -> float:
-    """Defocus of the sharpest frames: that of the narrowest edges, since soft content is wider; 0 if none was found."""
-    edges = seen.edges
-    if not profile.extensions.defocus_sigma_px or not len(edges):
-        return 0.0
+    """Defocus of the sharpest frames: that of the narrowest edges, since soft content is wider.
+
+    The profile's if it is 0, or if there are too few edges.
+    """
+    edges, stated_px = seen.edges, profile.extensions.defocus_sigma_px
+    if not stated_px or not seen.edges_determined:
+        return stated_px
     motion_px = predicted_blur(seen, profile, trajectory).motion_px
     moved_px = field.at_time(edges.stamp_s)[:, 0]
     left = edges.width_px**2 - fitted_width(motion_px, moved_px, LENS_SIGMA_PX) ** 2
