@@ -8,7 +8,6 @@ import random
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -67,24 +66,3 @@ def test_resume_after_a_kill_at_any_folder_change_gives_the_same_run(
         assert again.returncode == 0, (step, again.stderr)
         assert differences(out / "tiny", expected) == [], step
         assert sorted(p.name for p in out.iterdir()) == ["tiny"]
-
-
-@pytest.mark.scenario
-def test_resume_after_a_kill_at_a_random_time_gives_the_same_run(virest: Virest, tiny: Path, tmp_path: Path) -> None:
-    """The parent process is killed at a random time while two workers run."""
-    options = ("--preset", "fast", "--jobs", "2", "-q")
-    began = time.monotonic()
-    assert virest("process", tiny, "--out", tmp_path / "undisturbed", *options).returncode == 0
-    whole_s, expected = time.monotonic() - began, content(tmp_path / "undisturbed/tiny")
-    rng = random.Random(7)
-    for number in range(max(KILLS // 2, 1)):
-        out = tmp_path / f"killed-{number}"
-        command = [sys.executable, "-m", "virest", "process", str(tiny), "--out", str(out), *options]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
-            time.sleep(rng.uniform(0.3, 1.0) * whole_s)
-            process.kill()
-            process.communicate(timeout=60)  # returns when the last worker has closed the pipe
-        ended = (out / "tiny/run.json").exists() and not (out / "tiny/.run").exists()
-        again = virest("process", tiny, "--out", out, *options, "--resume")
-        assert again.returncode == 0, (number, ended, again.stderr)
-        assert differences(out / "tiny", expected) == [], number

@@ -53,21 +53,17 @@ def test_a_wrong_offset_is_replaced_by_the_tracked_points_one(virest, work: Path
     assert np.mean(psnrs_db(result, result, capture) - psnrs_db(true, result, capture)) > -0.3
 
 
-@pytest.mark.parametrize(("offset_s", "factor"), [(None, 1.5), (0.0, 0.5)])
-def test_a_wrong_readout_is_replaced_by_the_tracked_points_one(
-    virest, work: Path, offset_s: float | None, factor: float
-):
+def test_a_wrong_readout_is_replaced_by_the_tracked_points_one(virest, work: Path):
     """Rows then lie where they do with the right profile, and a stated offset stays."""
-    name = f"readout-{factor}"
-    capture = simulate(virest, work / name, *OPTIONS.split(), 28, "--frames", 20)
+    capture = simulate(virest, work / "readout", *OPTIONS.split(), 28, "--frames", 20)
     profile = yaml.safe_load((capture / "camera.yaml").read_text())
-    profile["shutter"]["readout_time_s"] *= factor
-    profile["imu"]["time_offset_s"] = offset_s
-    config = work / f"{name}.yaml"
+    profile["shutter"]["readout_time_s"] *= 0.5
+    profile["imu"]["time_offset_s"] = 0.0
+    config = work / "readout.yaml"
     config.write_text(yaml.safe_dump(profile))
     settings = ("--deblur", "none", "--frames", "6:14")
-    wrong = process(virest, capture, work / f"{name}-run", *settings, "--config", config)
-    right = process(virest, capture, work / f"{name}-right", *settings)
+    wrong = process(virest, capture, work / "readout-run", *settings, "--config", config)
+    right = process(virest, capture, work / "readout-right", *settings)
     assert said(wrong, "readout time of")
     assert not said(wrong, "frames indicate a time offset")
     assert not said(right, "readout time of")
@@ -75,7 +71,7 @@ def test_a_wrong_readout_is_replaced_by_the_tracked_points_one(
     assert np.abs(corners_px[0] - corners_px[1]).max() < 0.5
 
 
-@pytest.mark.parametrize(("scene", "seed"), [("text", 25), ("bright", 26), ("photographs", 27)])
+@pytest.mark.parametrize(("scene", "seed"), [("text", 25), ("bright", 26)])
 def test_a_correct_profile_is_not_contradicted(virest, work: Path, scene: str, seed: int):
     """No warning concerns clock or blur, and no frame is left alone for such a reason."""
     capture = simulate(virest, work / f"stated-right-{scene}", *OPTIONS.split(), seed, "--scene", scene)

@@ -17,7 +17,6 @@ FINE, COARSE = 1.0, 0.25
 """Bits per pixel of the movie."""
 HAND = {"width": 480, "height": 360, "frames": 3, "exposure_ms": 14.0, "rate_rad_s": 1.6, "noise_levels": 2.0}
 KINDS: dict[str, tuple[dict[str, Any], tuple[float, float, float]]] = {
-    "ordinary": ({"seed": 5, "bitrate_bits_per_px": FINE}, (2.0, 2.5, 3.5)),
     "long": ({"exposure_ms": 25.0, "rate_rad_s": 2.4, "seed": 7, "bitrate_bits_per_px": FINE}, (2.5, 2.5, 2.5)),
     "noisy": ({"noise_levels": 6.0, "seed": 8, "bitrate_bits_per_px": FINE}, (1.0, 1.5, 2.0)),
     "bright": ({"scene": "bright", "seed": 9, "bitrate_bits_per_px": FINE}, (0.3, 0.5, 2.5)),

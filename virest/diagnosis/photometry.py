@@ -30,6 +30,8 @@ _LOG_LIGHT = np.arange(-9.5, 0.75, 0.002)
 """Grid of the tabulated curve, natural logarithm of light."""
 _LIGHT_STEPS = 3
 """Steps of a patch's light; 2 or 6 give the same values to 0.001 σ (simulated vignetting and flicker)."""
+_GREY_STEP = 1 / 64
+"""Grid of the inverse, grey levels: the steps of a patch's light begin there."""
 _LEAST_SLOPE = 0.02
 """Grey levels per unit of log light below which an observation does not determine its light."""
 
@@ -141,19 +143,21 @@ def predict(observations: PhotometricObservations, profile: CameraProfile, weigh
     weight: (n,) weights in that fit; 1 / noise² unless given.
     """
     weight = 1.0 / observations.noise**2 if weight is None else weight
-    tables = _tables(profile.curve)
+    table = _table(profile.curve)
     factor, kept = log_light_factor(observations, profile), _kept(observations)
     patch = observations.patch
-    seen = np.interp(observations.grey, tables[0], _LOG_LIGHT) - factor
-    _, slope = _at(tables, seen + factor)
-    light = _patch_sum(patch, weight * slope**2 * seen) / _patch_sum(patch, weight * slope**2)
+    seen = table.log_light_of(observations.grey)
+    slope = table.at(seen)[1]
+    stiffness = weight * slope**2
+    light = _patch_sum(patch, stiffness * (seen - factor)) / _stiffness_sum(patch, stiffness)
     for left in reversed(range(_LIGHT_STEPS + 1)):
-        grey, slope = _at(tables, light[patch] + factor)
+        grey, slope = table.at(light[patch] + factor)
         residual = observations.grey - _remembered(kept, grey)
-        stiffness = weight * slope**2
-        whole = _patch_sum(patch, stiffness)
+        pull = weight * slope
+        stiffness = pull * slope
+        whole = _stiffness_sum(patch, stiffness)
         if left:
-            light = light + np.clip(_patch_sum(patch, weight * slope * residual) / whole, -1.0, 1.0)
+            light = light + np.clip(_patch_sum(patch, pull * residual) / whole, -1.0, 1.0)
     return Prediction(residual, slope, stiffness / whole[patch], observations)
 
 
@@ -208,23 +212,41 @@ def normalised_rms(observations: PhotometricObservations, profile: CameraProfile
 
 
 def _patch_sum(patch: Index, values: Array) -> Array:
-    total = np.asarray(np.bincount(patch, values), np.float64)
-    return np.maximum(total, 1e-12) if np.all(values >= 0) else total
+    return np.asarray(np.bincount(patch, values), np.float64)
+
+
+def _stiffness_sum(patch: Index, stiffness: Array) -> Array:
+    """Sums of what is not negative, kept above 0."""
+    return np.maximum(_patch_sum(patch, stiffness), 1e-12)
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """A curve on a uniform grid of log light, and its inverse on a uniform grid of grey levels."""
+
+    pieces: Array
+    """(m - 1, 4) grey of 255, its change to the next grid point, its slope per log light, the slope's change."""
+    inverse: Array
+    """Log light of grey levels _GREY_STEP apart."""
+
+    def at(self, log_light: Array) -> tuple[Array, Array]:
+        """Grey and its slope by linear interpolation, constant beyond the grid's ends."""
+        position = (log_light - _LOG_LIGHT[0]) / (_LOG_LIGHT[1] - _LOG_LIGHT[0])
+        position = np.minimum(np.maximum(position, 0.0), len(self.pieces) - 0.001)
+        index = position.astype(np.intp)
+        part = position - index
+        piece = self.pieces.take(index, axis=0)
+        return piece[:, 0] + part * piece[:, 1], piece[:, 2] + part * piece[:, 3]
+
+    def log_light_of(self, grey: Array) -> Array:
+        """Log light of the nearest grey level on the grid."""
+        return self.inverse.take((grey / _GREY_STEP + 0.5).astype(np.intp), mode="clip")
 
 
 @lru_cache(maxsize=16)
-def _tables(curve: ResponseCurve) -> tuple[Array, Array]:
-    """(grey of 255, its slope per log light) on the grid; the grey is made strictly increasing, for the inverse."""
+def _table(curve: ResponseCurve) -> _Table:
     grey = 255.0 * np.asarray(curve.encode(np.exp(_LOG_LIGHT)), float)
-    slope = np.gradient(grey, _LOG_LIGHT)
-    return grey + 1e-9 * np.arange(len(grey)), np.maximum(slope, _LEAST_SLOPE)
-
-
-def _at(tables: tuple[Array, Array], log_light: Array) -> tuple[Array, Array]:
-    """Grey and its slope by linear interpolation on the uniform grid, constant beyond its ends."""
-    step = _LOG_LIGHT[1] - _LOG_LIGHT[0]
-    position = np.clip((log_light - _LOG_LIGHT[0]) / step, 0, len(_LOG_LIGHT) - 1.001)
-    index = position.astype(np.intp)
-    part = position - index
-    grey, slope = (table[index] * (1 - part) + table[index + 1] * part for table in tables)
-    return grey, slope
+    slope = np.maximum(np.gradient(grey, _LOG_LIGHT), _LEAST_SLOPE)
+    increasing = grey + 1e-9 * np.arange(len(grey))  # strictly, for the inverse
+    pieces = np.stack([grey[:-1], np.diff(grey), slope[:-1], np.diff(slope)], axis=-1)
+    return _Table(pieces, np.interp(np.arange(0.0, 255.0 + _GREY_STEP, _GREY_STEP), increasing, _LOG_LIGHT))

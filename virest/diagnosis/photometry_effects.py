@@ -273,16 +273,19 @@ def _sines(
     start = np.flatnonzero(np.diff(dense, prepend=-1))
     total = np.add.reduceat(stiffness, start)
     root = np.sqrt(stiffness)
-    right = root * (values - (np.add.reduceat(stiffness * values, start) / total)[dense])
-    wave = np.exp(2j * np.pi * frequency[0] * time_s)
-    turn = np.exp(2j * np.pi * (frequency[1] - frequency[0]) * time_s)
+    right = (root * (values - (np.add.reduceat(stiffness * values, start) / total)[dense])).astype(np.float32)
+    exposures_s, which = np.unique(exposure_s, return_inverse=True)
+    wave = np.exp(2j * np.pi * frequency[0] * time_s).astype(np.complex64)
+    turn = np.exp(2j * np.pi * (frequency[1] - frequency[0]) * time_s).astype(np.complex64)
+    mean_by, stiff, scale = (part.astype(np.float32) for part in (1 / total, stiffness, root))
+    factor = np.sinc(frequency[:, None] * exposures_s).astype(np.float32)
     fit, power = np.zeros((len(frequency), 2)), np.zeros(len(frequency))
     for i in range(len(frequency)):
-        seen = np.sinc(frequency[i] * exposure_s) * wave
-        column = root * (seen - (np.add.reduceat(stiffness * seen, start) / total)[dense])
-        sine, cosine = column.imag, column.real
-        a, b, c = sine @ sine, sine @ cosine, cosine @ cosine
-        p, q = sine @ right, cosine @ right
+        seen = factor[i][which] * wave
+        column = scale * (seen - (np.add.reduceat(stiff * seen, start) * mean_by)[dense])
+        pair = column.view(np.float32).reshape(-1, 2)  # cosine, sine
+        (c, b), (_, a) = (pair.T @ pair).tolist()
+        q, p = (right @ pair).tolist()
         determinant = max(a * c - b * b, 1e-9 * a * c + 1e-12)
         fit[i] = (c * p - b * q) / determinant, (a * q - b * p) / determinant
         power[i] = fit[i] @ (p, q)

@@ -19,7 +19,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
 from virest.image_formation.row_clock import RowClock
 from virest.inference.frame_delays import FrameDelays, Turns, fit_frame_delays, unexplained_turns
-from virest.inference.frame_exposures import AS_LOGGED, ROWS_LATE, OwnExposures, by_brightness
+from virest.inference.frame_exposures import AS_LOGGED, ROWS_LATE, OwnExposures, by_brightness, unlogged_log_light
 from virest.inference.observed_tracks import ObservedTracks, frame_times, observe_tracks
 from virest.inference.tracking import TrackPair
 from virest.restoration.capture import RestorationPlan
@@ -32,6 +32,8 @@ POINTS_PER_PAIR = 60
 """Points of a pair that are used: three numbers are fitted to them."""
 MOST_FRAMES = 3000
 """Frames of a movie that are tracked for delays of their own, the first ones: 3000 of 640×480 take 20 s."""
+LEAST_GAIN_STD = 0.05
+"""Deviation of the log light over the logged one from which exposures may be wrong: half a pixel of a path of 10 px."""
 SAME_START_S, LEAST_OWN = 1e-4, 0.5
 """Distance at which a knot is that of a frame; least part of frames and knots that are, for delays of single frames."""
 SOURCE = "tracked points against the gyroscope, frame by frame"
@@ -90,12 +92,13 @@ def find_frame_times(
     observed = observe_tracks(capture, pairs, profile)
     turns = _turns(observed, capture.imu, profile)
     found = None if turns is None else fit_frame_delays(turns)
-    if turns is None or found is None or found.p >= VALUE_P:
+    if turns is None or found is None:
         return None
     noise_px = float(np.median(observed.noise_px))
     moved_px = found.jitter_s * turns.rate_rad_s * profile.intrinsics.fx_px
     log.debug("frames' delays of %.2g s (p = %.2g) move points by %.2g px", found.jitter_s, found.p, moved_px)
-    if moved_px < np.sqrt(CONTRADICTED**2 - 1) * noise_px:
+    late = found.p < VALUE_P and moved_px >= np.sqrt(CONTRADICTED**2 - 1) * noise_px
+    if not late and not _light_differs(capture, observed, profile):
         return None
     usable = [frame for frame in capture.frames if frame.skip_reason is None]
     wanted = [frame.index for frame in usable[:MOST_FRAMES]]
@@ -105,7 +108,10 @@ def find_frame_times(
         found = (fit_frame_delays(turns) if turns is not None else None) or found
     if own := _own_exposures(capture, observed, profile, found):
         text = f"{_described(own)}: each frame is restored with its own"
-        return FrameTimes(replace(capture, frames=own.of(capture.frames)), given, text, own)
+        most_left = MOST_LEFT if late else None
+        return FrameTimes(replace(capture, frames=own.of(capture.frames)), given, text, own, most_left)
+    if not late:
+        return None
     text = (
         f"stamps differ from frame to frame by {1e3 * found.jitter_s:.1f} ms (rms) from the times that points show, "
         "which are used instead"
@@ -177,6 +183,14 @@ def _turns(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) ->
     if not observed.pairs:
         return None
     return unexplained_turns(imu, observed.table(POINTS_PER_PAIR * len(observed.pairs)), profile)
+
+
+def _light_differs(capture: Capture, observed: ObservedTracks, profile: CameraProfile) -> bool:
+    """Whether the brightness of tracked frames changes as if exposures differed from the logged ones noticeably."""
+    if any(frame.exposure_s is None for frame in capture.frames):
+        return False
+    log_light = unlogged_log_light(capture.frames, observed.pairs, profile.curve)
+    return bool(np.nanstd(log_light) > LEAST_GAIN_STD)
 
 
 def _own_exposures(
