@@ -106,6 +106,20 @@ def test_exposures_that_the_log_lacks_follow_the_brightness(capture: Capture) ->
     assert np.std(middles_s(flat, plan) - right_s) < 0.1 * np.std(own_s / 2)
 
 
+def test_exposures_that_change_slowly_unlogged_follow_the_brightness(tmp_path: Path) -> None:
+    """No frame is late by itself: the brightness says how the exposures may have changed, the points that they did."""
+    simulate_command(
+        tmp_path / "hand", width=320, height=240, frames=FRAMES, seed=9, rate_rad_s=1.5, exposure_ms=12.0,
+        noise_levels=1.0, bitrate_bits_per_px=1.5,
+    )  # fmt: skip
+    right = read_capture(tmp_path / "hand")
+    factor = 1 + 0.5 * np.sin(2 * np.pi * np.arange(FRAMES) / FRAMES)
+    logged = tuple(replace(f, exposure_s=0.012 * float(factor[f.index])) for f in right.frames)
+    plan = planned(replace(right, frames=logged))
+    assert "differ from the logged ones as brightness does" in said(plan)[-1]
+    np.testing.assert_allclose(np.ptp(np.log(np.array(plan.profile.extensions.exposure_gain) * factor)), 0, atol=0.05)
+
+
 def test_exposures_in_other_rows_are_given_back_to_their_frames(capture: Capture) -> None:
     """The plan's profile says by how many rows, and a run with that profile finds no more of them.
 
