@@ -120,6 +120,33 @@ def test_exposures_that_change_slowly_unlogged_follow_the_brightness(tmp_path: P
     np.testing.assert_allclose(np.ptp(np.log(np.array(plan.profile.extensions.exposure_gain) * factor)), 0, atol=0.05)
 
 
+@pytest.mark.scenario
+@pytest.mark.parametrize("hidden", ["exposures", "stamps"])
+def test_the_length_of_blur_tells_exposures_from_stamps(tmp_path: Path, hidden: str) -> None:
+    """Both delay frames alike where gains compensate for the exposures; each is found where it is true."""
+    simulate_command(
+        tmp_path / "hand", width=320, height=240, frames=FRAMES, seed=10, rate_rad_s=2.0, noise_levels=1.0,
+        bitrate_bits_per_px=1.5, exposure_ms=[8.0, 8.0, 8.0, 16.0, 16.0, 16.0] if hidden == "exposures" else 12.0,
+    )  # fmt: skip
+    right = read_capture(tmp_path / "hand")
+    late_s = np.where(np.arange(FRAMES) % 6 < 3, -0.002, 0.002)
+    own_s = np.array([frame.exposure_s for frame in right.frames], float)
+    if hidden == "exposures":
+        told = [replace(f, exposure_s=0.012, iso=f.iso * own_s[f.index] / 0.012) for f in right.frames]
+    else:
+        told = [replace(f, time_s=f.time_s - float(late_s[f.index])) for f in right.frames]
+    capture = replace(right, frames=tuple(told))
+    read = partial(read_decodable_gray, capture.movie, probe_movie(capture.movie))
+    plan = plan_restoration(capture, resolve_profile(capture)[0], PRESETS["fast"], read)
+    (*_, text) = said(plan)
+    if hidden == "stamps":
+        assert "stamps differ from frame to frame" in text
+        assert not plan.profile.extensions.exposure_gain
+    else:
+        assert "exposure times differ from the logged ones as frames are late" in text
+        np.testing.assert_allclose(np.array(plan.profile.extensions.exposure_gain) * 0.012, own_s, atol=0.0012)
+
+
 def test_exposures_in_other_rows_are_given_back_to_their_frames(capture: Capture) -> None:
     """The plan's profile says by how many rows, and a run with that profile finds no more of them.
 

@@ -33,7 +33,6 @@ from virest.diagnosis.field.brightness import (
 )
 from virest.diagnosis.field.contradicted import known_stretches
 from virest.diagnosis.field.focus import blur_fields
-from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import (
@@ -51,6 +50,8 @@ from virest.diagnosis.geometric_findings import findings_of, with_depth_of, with
 from virest.diagnosis.geometric_ladder import MAX_RUNGS
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.own_exposures import (
+    delay_of_frames,
+    exposures_of_blur,
     exposures_of_points,
     measured_log_light,
     rows_late,
@@ -110,6 +111,8 @@ def diagnose_capture(
     session = _climbed(capture, profile, pictures, gray, report, each, frozenset(kept_back))
     found = session.conclude()
     own = session.own_exposures(found)
+    if own is None and delay_of_frames(found):
+        own = exposures_of_blur(capture, profile, gray)
     if own is None:
         return found
 
@@ -392,7 +395,7 @@ class DiagnosisSession:
         if self.exposures_late_frames:
             return OwnExposures(self.exposures_late_frames)
         drift = any(cause.name == "gain_drift" for cause in found.causes)
-        late = any((field.kind, field.covariates) == ("delay", (TIME,)) for field in found.fields)
+        late = delay_of_frames(found) is not None
         if not late and not drift:
             return None
         measured = measured_log_light(self.light_of_patches or self.light, len(self.capture.frames))

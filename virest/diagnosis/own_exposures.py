@@ -15,7 +15,7 @@ import numpy as np
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import STAMP_FRACTION
-from virest.capture.records import Frame
+from virest.capture.records import Capture, Frame
 from virest.diagnosis.candidates import varies
 from virest.diagnosis.cross_validation import JUDGE_POINTS, LAGGING_BLOCK
 from virest.diagnosis.field.forms import TIME
@@ -33,15 +33,24 @@ from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.diagnosis.photometry_effects import GainDrift
 from virest.diagnosis.photometry_fit import fit_photometry
 from virest.diagnosis.picture_ladder import PictureVerdict
+from virest.diagnosis.restoration_gain import Reader, decodable
 from virest.diagnosis.selection import WORD_LEVELS
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import RowClock
 from virest.inference.chance import chance_of
-from virest.inference.frame_exposures import ROWS_LATE, OwnExposures, by_brightness, unlogged_log_light
+from virest.inference.frame_exposures import (
+    LEAST_GAIN_STD,
+    ROWS_LATE,
+    OwnExposures,
+    by_brightness,
+    unlogged_log_light,
+)
 from virest.inference.hold_out import group_means, loss
 from virest.inference.profile_terms import TERMS
 from virest.inference.track_fit import TrackFit
+from virest.restoration.capture_estimation import plan_restoration
 from virest.restoration.frame_time_plan import rows_apart
+from virest.restoration.settings import PRESETS
 
 TABLE = "exposure_rows"
 """Kind of the finding for an exposure table that is some rows off; ``extensions.exposures_late_frames`` holds it."""
@@ -119,9 +128,11 @@ def exposures_of_points(
         tried += [(rows, exposure_s[m] / exposure_s) for rows, m in zip(ROWS_LATE, moved, strict=True)]
     pairs, curve = evidence.observed.pairs, geometric.model.profile.curve
     if measured is None:
-        tried.append((0, np.array(by_brightness(frames, pairs, curve).gain)))
+        gain = np.array(by_brightness(frames, pairs, curve).gain)
     else:
-        tried.append((0, np.exp(np.nan_to_num(unlogged_log_light(frames, pairs, curve, measured)))))
+        gain = np.exp(np.nan_to_num(unlogged_log_light(frames, pairs, curve, measured)))
+    if gain.std() > LEAST_GAIN_STD * gain.mean():
+        tried.append((0, gain))
     models = geometric.nominal, _with_terms(geometric.nominal, *CLOCKS), geometric.model
     found = []
     for model in (_with_terms(model, "exposure_time") for model in models):
@@ -136,6 +147,16 @@ def exposures_of_points(
             if not rows and fits and WORD_LEVELS.significant(p_value):
                 found.append((p_value, OwnExposures(gain=scaled, p_value=p_value)))
     return min(found, key=lambda one: one[0])[1] if found else None
+
+
+def exposures_of_blur(capture: Capture, profile: CameraProfile, gray: Reader) -> OwnExposures | None:
+    """Exposures that delay frames as found, if `process` finds that the length of their blur confirms them."""
+    plan = plan_restoration(capture, profile, PRESETS["fast"], lambda numbers: decodable(gray, numbers))
+    if plan.profile.extensions.exposure_gain == profile.extensions.exposure_gain:
+        return None
+    frames = range(len(capture.frames))
+    own, given = (one.extensions.exposure_gain_of(frames) for one in (plan.profile, profile))
+    return OwnExposures(gain=tuple((own / given).tolist()))
 
 
 def _with_terms(model: Model, *names: str) -> Model:
@@ -195,14 +216,14 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
     left in the points that was not before; with exposures as exact as measured brightness, no gain of the light and no
     delay of frames.
     """
-    delay = _delay_of_frames(found)
+    delay = delay_of_frames(found)
     nominal = found.nominal
     held_out = HeldOutGain(GEOMETRY, nominal.geometry_rms_px, _points_left_px(found), nominal.geometry_noise_px)
     held_out = held_out if delay is None else delay.held_out
     gain = replace(held_out, after=_points_left_px(given), noise=given.nominal.geometry_noise_px)
     if (gain.gain or 0.0) < RIVAL_GAIN_FRACTION * (held_out.gain or 0.0):
         return found
-    remains = any(cause.name == "gain_drift" for cause in given.causes) or _delay_of_frames(given) is not None
+    remains = any(cause.name == "gain_drift" for cause in given.causes) or delay_of_frames(given) is not None
     if remains if own.gain else given.unexplained.significant and not found.unexplained.significant:
         return found
     if own.gain:
@@ -210,11 +231,13 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
     points = f"(points {gain.before:.3f} px → {gain.after:.3f} px): with its own, each frame is where the points are"
     if own.gain:
         size = max(own.gain, key=lambda g: abs(g - 1)) - 1
+        of_brightness = own.p_value is not None
+        p_value = own.p_value if delay is None or of_brightness else delay.p_value
         told = FieldFinding(
-            ("exposure",), UNLOGGED, "as the brightness",
-            f"exposure times change as the brightness does, up to {abs(size):.0%} "
-            f"{'longer' if size > 0 else 'shorter'} than logged {points}",
-            size, "1", None, gain, own.p_value, (), None,
+            ("exposure",), UNLOGGED, f"as the {'brightness' if of_brightness else 'delays of frames'}",
+            f"exposure times change as {'the brightness does' if of_brightness else 'frames are late'}, up to "
+            f"{abs(size):.0%} {'longer' if size > 0 else 'shorter'} than logged {points}",
+            size, "1", None, gain, p_value, (), None,
             "a sensor that alternates exposures (HDR), or a log of the exposures that were asked for",
             "film an LED display that counts milliseconds, and compare the counts in a frame with its exposure time",
         )  # fmt: skip
@@ -237,7 +260,8 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
     )
 
 
-def _delay_of_frames(found: Diagnosis) -> FieldFinding | None:
+def delay_of_frames(found: Diagnosis) -> FieldFinding | None:
+    """The delays of frames that a diagnosis found."""
     over_time = (field for field in found.fields if (field.kind, field.covariates) == ("delay", (TIME,)))
     return next(over_time, None)
 

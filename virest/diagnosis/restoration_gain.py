@@ -306,17 +306,16 @@ def _planned(capture: Capture, profile: CameraProfile, gray: Reader, settings: R
     return PairsRestored(plan, frames, {}, trajectory, lens, guide)
 
 
+def decodable(gray: Reader, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+    """The frames that can be decoded."""
+    return ((index, picture) for index, picture in gray(numbers) if picture is not None)
+
+
 def _plan(capture: Capture, profile: CameraProfile, gray: Reader, settings: RestorationSettings) -> RestorationPlan:
     """The plan that `process` would use; a scene at infinity needs no estimate of translation."""
     if profile.depth_m is not None and np.isinf(profile.depth_m) and profile.intrinsics is not None:
         return RestorationPlan(profile, settings, imu_gaps_s=capture.imu_gaps_s)
-
-    def decodable(numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-        for index, picture in gray(numbers):
-            if picture is not None:
-                yield index, picture
-
-    plan = plan_restoration(capture, profile, settings, decodable)
+    plan = plan_restoration(capture, profile, settings, lambda numbers: decodable(gray, numbers))
     return dataclasses.replace(plan, refusal=None, contradicted=None, missing_turn=None, mask=None, confirmed=None)
 
 

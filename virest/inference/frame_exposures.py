@@ -22,6 +22,8 @@ from virest.inference.tracking import TrackPair
 
 ROWS_LATE = (1, -1, 2, -2)
 """Rows by which a table of exposures may lag (+) or lead (−) the movie."""
+LEAST_GAIN_STD = 0.05
+"""Relative deviation of exposures from the logged ones that matters: half a pixel of a path of 10 px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +34,8 @@ class OwnExposures:
     gain: tuple[float, ...] = ()
     """(frames,) factors on the exposure times by movie index; empty: none."""
     p_value: float | None = None
-    """Of the points' better agreement with these exposures; None: the delay of frames that they replace has one."""
+    """Of the points' better agreement with exposures that follow the brightness; None: the delay of frames that they
+    replace has one."""
 
     def __bool__(self) -> bool:
         return bool(self.rows_late or self.gain)

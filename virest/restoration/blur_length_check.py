@@ -113,6 +113,24 @@ def path_scale(frames: Iterable[tuple[RowMotion, TilePowers]], bits_per_px: floa
     return PathScale(float(np.exp(best)), float(np.hypot(scatter, MODEL_STD * (1 + starved))), len(evidence))
 
 
+def log_lengths(frames: Iterable[tuple[RowMotion, TilePowers]]) -> Array:
+    """Logarithm (frames,) of each frame's own path length over the predicted one; NaN: not measured.
+
+    A frame alone measures it to MODEL_STD, or not at all where the scene has a direction.
+    """
+    seen = (_evidence(motion, tiles) for motion, tiles in frames)
+    return np.array([np.nan if one is None else _best(_low_ring_evidence(one)) for one in seen])
+
+
+def log_likelihood_of_lengths(lengths: Array) -> float:
+    """Log likelihood of log lengths (n,) that share one factor, at the factor that fits best, up to a constant.
+
+    Their errors are taken for Cauchy-distributed with a width of MODEL_STD.
+    """
+    off = (lengths[:, None] - lengths) / MODEL_STD
+    return -float(np.log1p(off**2).sum(axis=0).min(initial=np.inf))
+
+
 # ── parts ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 

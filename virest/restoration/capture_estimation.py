@@ -20,7 +20,7 @@ from virest.capture.frame_coding import FrameCoding
 from virest.capture.imu import ImuSamples
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import RowClock
-from virest.image_formation.row_motion import FrameTranslation, frame_times_s
+from virest.image_formation.row_motion import FrameTranslation, RowMotion, frame_times_s
 from virest.inference.camera_travel import FrameMotion, VisualInertialAlignment
 from virest.inference.coarse_alignment import MIN_EXPLAINED, STEP_S, align_coarsely
 from virest.inference.doubtful_log import doubts
@@ -41,7 +41,14 @@ from virest.inference.unsharp_mask import MOST_FRAMES
 from virest.inference.visual_inertial import align, choose_runs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
-from virest.restoration.blur_length_check import TilePowers, frames_to_measure, path_scale, store_powers
+from virest.restoration.blur_length_check import (
+    TilePowers,
+    frames_to_measure,
+    log_lengths,
+    log_likelihood_of_lengths,
+    path_scale,
+    store_powers,
+)
 from virest.restoration.capture import (
     FOCAL_UNKNOWN,
     RestorationPlan,
@@ -61,6 +68,7 @@ from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbour_plan import with_neighbour_survey
 from virest.restoration.neighbours.survey import store_lumas, survey_runs
 from virest.restoration.plan_notes import NoteCode, PlanNote
+from virest.restoration.profile_conflict import VALUE_P
 from virest.restoration.settings import RestorationSettings
 
 MIN_COARSE_EXPLAINED = 0.5
@@ -149,6 +157,11 @@ def _planned(
         if times is not None:
             again = _planned(times.capture, times.profile, settings, read_gray, coding)
             if times.explain(plan, again):
+                if times.instead is not None:
+                    other = _planned(times.instead.capture, times.instead.profile, settings, read_gray, coding)
+                    own = times.instead.noted(other)
+                    if times.instead.explain(plan, other) and _lengths_prefer(own, times.noted(again), capture, powers):
+                        return own
                 return times.noted(again)
     if plan.refusal is None and not _clock_agrees(alignment, plan.profile):
         resting = _through_resting_lens(tracked, capture, plan.profile)
@@ -277,6 +290,36 @@ def _rough_paths_px(capture: Capture, profile: CameraProfile, chosen: Iterable[i
     return dict(zip((f.index for f in frames), (focal_px * at_frames * exposure_s).tolist(), strict=True))
 
 
+def _with_motion(
+    plan: RestorationPlan, capture: Capture, powers: Mapping[int, TilePowers]
+) -> list[tuple[RowMotion, TilePowers]]:
+    """The spectra of frames with the motion that a plan gives these, in their order in the movie."""
+    profile = plan.profile
+    trajectory = integrate_gyro(capture.imu, profile)
+    lens, known = moving_lens(trajectory, profile), plan.translations or {}
+    frames = at_true_times(capture.frames, profile, capture.repeats)
+    return [
+        (
+            moved_over_frame(trajectory, lens, frames[index], plan.settings.reference, known.get(index), profile),
+            powers[index],
+        )
+        for index in sorted(powers)
+    ]
+
+
+def _lengths_prefer(
+    plan: RestorationPlan, other: RestorationPlan, capture: Capture, powers: Mapping[int, TilePowers]
+) -> bool:
+    """Whether the length of blur in the frames makes a plan's paths likelier by far than those of another one.
+
+    Of two hypotheses, the wrong one is k times as likely as the right one with a probability of at most 1 / k.
+    """
+    by_plan = [log_lengths(_with_motion(one, capture, powers)) for one in (plan, other)]
+    measured = np.isfinite(by_plan).all(axis=0)
+    likelihood, of_other = (log_likelihood_of_lengths(lengths[measured]) for lengths in by_plan)
+    return likelihood > of_other + np.log(1 / VALUE_P)
+
+
 def _with_blur_length_check(
     plan: RestorationPlan, given: CameraProfile, capture: Capture, powers: Mapping[int, TilePowers]
 ) -> RestorationPlan:
@@ -289,17 +332,8 @@ def _with_blur_length_check(
     profile = plan.profile
     if not powers or profile.intrinsics is None:
         return plan
-    trajectory = integrate_gyro(capture.imu, profile)
-    lens, known = moving_lens(trajectory, profile), plan.translations or {}
     frames = at_true_times(capture.frames, profile, capture.repeats)
-    shown = [
-        (
-            moved_over_frame(trajectory, lens, frames[index], plan.settings.reference, known.get(index), profile),
-            powers[index],
-        )
-        for index in sorted(powers)
-    ]
-    found = path_scale(shown, capture.bits_per_px)
+    found = path_scale(_with_motion(plan, capture, powers), capture.bits_per_px)
     if found is None or not found.contradicts:
         return plan
     shutter, offset_s, explained = profile.shutter, profile.time_offset_s or 0.0, ""

@@ -15,11 +15,19 @@ import numpy as np
 from virest.arrays import Array
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
+from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, Frame
 from virest.image_formation.row_clock import RowClock
-from virest.inference.frame_delays import FrameDelays, Turns, fit_frame_delays, unexplained_turns
-from virest.inference.frame_exposures import AS_LOGGED, ROWS_LATE, OwnExposures, by_brightness, unlogged_log_light
+from virest.inference.frame_delays import MIN_PAIRS, FrameDelays, Turns, fit_frame_delays, unexplained_turns
+from virest.inference.frame_exposures import (
+    AS_LOGGED,
+    LEAST_GAIN_STD,
+    ROWS_LATE,
+    OwnExposures,
+    by_brightness,
+    unlogged_log_light,
+)
 from virest.inference.observed_tracks import ObservedTracks, frame_times, observe_tracks
 from virest.inference.tracking import TrackPair
 from virest.restoration.capture import RestorationPlan
@@ -32,8 +40,10 @@ POINTS_PER_PAIR = 60
 """Points of a pair that are used: three numbers are fitted to them."""
 MOST_FRAMES = 3000
 """Frames of a movie that are tracked for delays of their own, the first ones: 3000 of 640×480 take 20 s."""
-LEAST_GAIN_STD = 0.05
-"""Deviation of the log light over the logged one from which exposures may be wrong: half a pixel of a path of 10 px."""
+DELAY_PASSES = 2
+"""Fits of delays from which exposures follow: a delay is that of a middle, which moves with the exposure itself."""
+LEAST_EXPOSURE = 0.1
+"""Least part of its logged exposure time that a frame can have had: delays that need less come from stamps."""
 SAME_START_S, LEAST_OWN = 1e-4, 0.5
 """Distance at which a knot is that of a frame; least part of frames and knots that are, for delays of single frames."""
 SOURCE = "tracked points against the gyroscope, frame by frame"
@@ -51,6 +61,8 @@ class FrameTimes:
     """Message about it."""
     own: OwnExposures = AS_LOGGED
     """Exposures of the frames, other than the logged ones."""
+    instead: FrameTimes | None = None
+    """Exposures of the frames that would delay them by as much; only blur tells them from stamps that jitter."""
     most_left: float | None = MOST_LEFT
     """Largest part of the contradiction that may remain; None: any, since times of a few frames hardly change it."""
 
@@ -107,9 +119,9 @@ def find_frame_times(
         turns = _turns(observed, capture.imu, profile)
         found = (fit_frame_delays(turns) if turns is not None else None) or found
     if own := _own_exposures(capture, observed, profile, found):
-        text = f"{_described(own)}: each frame is restored with its own"
+        text = f"{_described(own, bright=True)}: each frame is restored with its own"
         most_left = MOST_LEFT if late else None
-        return FrameTimes(replace(capture, frames=own.of(capture.frames)), given, text, own, most_left)
+        return FrameTimes(replace(capture, frames=own.of(capture.frames)), given, text, own, None, most_left)
     if not late:
         return None
     text = (
@@ -118,7 +130,50 @@ def find_frame_times(
     )
     text += f" in the first {MOST_FRAMES} frames" if len(usable) > MOST_FRAMES else ""
     # a frame more, which has no delay, since beyond its last knot a field is constant
-    return FrameTimes(capture, _with_delays(given, profile, capture, usable[: MOST_FRAMES + 1], found), text)
+    instead = None
+    if own := _exposures_by_delays(capture, observed, profile, found):
+        said = f"{_described(own)}: each frame is restored with its own"
+        instead = FrameTimes(replace(capture, frames=own.of(capture.frames)), given, said, own)
+    return FrameTimes(
+        capture, _with_delays(given, profile, capture, usable[: MOST_FRAMES + 1], found), text, instead=instead
+    )
+
+
+def _exposures_by_delays(
+    capture: Capture, observed: ObservedTracks, profile: CameraProfile, delays: FrameDelays
+) -> OwnExposures:
+    """Exposures that delay frames as found, but for a common delay; the logged ones where a stamp marks the middle.
+
+    An exposure of E instead of the logged one moves a frame's middle by (½ − f) (E − logged), its stamp being at a
+    fraction f of the exposure.  Delays are found once more with the exposures that follow from them.
+    """
+    to_middle = 0.5 - STAMP_FRACTION[profile.shutter.timestamp]
+    if not to_middle or any(frame.exposure_s is None for frame in capture.frames):
+        return AS_LOGGED
+    own = AS_LOGGED
+    found: FrameDelays | None = delays
+    gain = np.ones(len(capture.frames))
+    for _ in range(DELAY_PASSES):
+        if found is None or len(found.frame) < MIN_PAIRS:
+            return AS_LOGGED
+        trend = np.polynomial.Polynomial.fit(found.frame, found.late_s, 1)
+        longer_s = (found.late_s - trend(found.frame)) / to_middle
+        logged_s = np.array([capture.frames[k].exposure_s for k in found.frame], float)
+        gain[found.frame] += longer_s / profile.shutter.true_exposure_s(logged_s)
+        if gain.min() < LEAST_EXPOSURE:
+            return AS_LOGGED
+        own = OwnExposures(gain=tuple(gain.tolist()))
+        found = _delays_with(own, capture, observed, profile)
+    return own if gain.std() > LEAST_GAIN_STD else AS_LOGGED
+
+
+def _delays_with(
+    own: OwnExposures, capture: Capture, observed: ObservedTracks, profile: CameraProfile
+) -> FrameDelays | None:
+    """The delays that frames with these exposures still have."""
+    corrected = replace(capture, frames=own.of(capture.frames))
+    turns = _turns(replace(observed, exposure_s=frame_times(corrected)[1]), capture.imu, profile)
+    return None if turns is None else fit_frame_delays(turns)
 
 
 def _with_further_delays(
@@ -164,12 +219,14 @@ def _with_further_delays(
     return FrameTimes(capture, completed, text, most_left=None)
 
 
-def _described(own: OwnExposures) -> str:
+def _described(own: OwnExposures, bright: bool = False) -> str:
     """What is wrong with the logged exposures, in words."""
     if own.rows_late:
         return f"exposure times are logged {rows_apart(own.rows_late)}"
-    shortest, longest = min(own.gain), max(own.gain)
-    return f"exposure times differ from the logged ones as brightness does, by factors {shortest:.2f} to {longest:.2f}"
+    factors = f"by factors {min(own.gain):.2f} to {max(own.gain):.2f}"
+    return (
+        f"exposure times differ from the logged ones as {'brightness does' if bright else 'frames are late'}, {factors}"
+    )
 
 
 def rows_apart(rows_late: int) -> str:
@@ -207,9 +264,7 @@ def _own_exposures(
         tried.append(by_brightness(capture.frames, observed.pairs, profile.curve))
     costs: list[float] = []
     for own in tried:
-        corrected = replace(capture, frames=own.of(capture.frames))
-        turns = _turns(replace(observed, exposure_s=frame_times(corrected)[1]), capture.imu, profile)
-        found = None if turns is None else fit_frame_delays(turns)
+        found = _delays_with(own, capture, observed, profile)
         costs.append(np.inf if found is None else found.cost)
     best = int(np.argmin(costs)) if costs else 0
     likelier = bool(costs) and costs[best] < delays.cost - np.log(len(tried) / VALUE_P)
