@@ -6,7 +6,7 @@ the frames.  Camera translation and scene depth are estimated where the capture 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,6 +42,7 @@ from virest.inference.visual_inertial import align, choose_runs
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
 from virest.restoration.blur_length_check import (
+    PathScale,
     TilePowers,
     frames_to_measure,
     log_lengths,
@@ -185,7 +186,16 @@ def _planned(
     if alignment is not None:
         plan = _with_translations(plan, capture, alignment)
     plan = _without_false_defocus(plan, capture, lumas)
-    plan = _with_blur_length_check(plan, profile, capture, powers)
+    plan, lengths = _with_blur_length_check(plan, profile, capture, powers)
+    if lengths is not None and (scale := _exposure_of_points(plan, profile, capture, tracked, lengths)) is not None:
+        shutter = replace(profile.shutter, exposure_scale=scale * profile.shutter.exposure_scale)
+        again = _planned(capture, replace(profile, shutter=shutter), settings, read_gray, coding)
+        if again.refusal is None and again.contradicted is None:
+            text = (
+                f"blur and tracked points show exposures of {scale:.2f} times the profile's, which are used instead: "
+                f"{CALIBRATE_EXPOSURE}"
+            )
+            return again.noted(NoteCode.BLUR_LENGTH, text)
     return with_neighbour_survey(plan, capture, surveyed, lumas, coding)
 
 
@@ -322,8 +332,10 @@ def _lengths_prefer(
 
 def _with_blur_length_check(
     plan: RestorationPlan, given: CameraProfile, capture: Capture, powers: Mapping[int, TilePowers]
-) -> RestorationPlan:
+) -> tuple[RestorationPlan, PathScale | None]:
     """Note blur paths of another length than predicted, and set ``contradicted`` so that harmful steps are skipped.
+
+    Returns the plan, and the length; None: as predicted, or not measured.
 
     An offset from tracked points holds at mid-exposure, so it is corrected for the different exposure time.  A stated
     offset is kept for the observed motion if the points do not contradict it, or if the different exposure time
@@ -331,11 +343,11 @@ def _with_blur_length_check(
     """
     profile = plan.profile
     if not powers or profile.intrinsics is None:
-        return plan
+        return plan, None
     frames = at_true_times(capture.frames, profile, capture.repeats)
     found = path_scale(_with_motion(plan, capture, powers), capture.bits_per_px)
     if found is None or not found.contradicts:
-        return plan
+        return plan, None
     shutter, offset_s, explained = profile.shutter, profile.time_offset_s or 0.0, ""
     if profile.time_offset_s != given.time_offset_s:
         logged_s = float(np.median([frames[index].exposure_s or 0.0 for index in powers]))
@@ -351,7 +363,32 @@ def _with_blur_length_check(
     text = f"{OTHER_PATHS} {found} times as long as the profile says{explained}: {CALIBRATE_EXPOSURE}"
     shutter = replace(shutter, exposure_scale=shutter.exposure_scale * found.scale)
     contradicted = replace(profile, shutter=shutter, time_offset_s=offset_s)
-    return replace(plan, contradicted=contradicted).noted(NoteCode.BLUR_LENGTH, text)
+    return replace(plan, contradicted=contradicted).noted(NoteCode.BLUR_LENGTH, text), found
+
+
+def _exposure_of_points(
+    plan: RestorationPlan,
+    given: CameraProfile,
+    capture: Capture,
+    tracked: Sequence[TrackPair],
+    lengths: PathScale,
+) -> float | None:
+    """Factor on all exposures with which the tracked points agree with a stated offset; None if blur shows another.
+
+    A longer exposure moves its middle away from the stamp, as an offset does; it lengthens blur paths, as no offset
+    does.  Points determine it more accurately, and both agree only if the exposure is wrong.
+    """
+    shutter = given.shutter
+    logged_s = [frame.exposure_s for frame in capture.frames if frame.exposure_s]
+    to_middle_s = (0.5 - STAMP_FRACTION[shutter.timestamp]) * shutter.true_exposure_s(float(np.median(logged_s)))
+    if given.time_offset_s is None or not to_middle_s:
+        return None
+    estimate = refine_time_offset(observe_tracks(capture, tracked, plan.profile), capture.imu, plan.profile)
+    factor = 1 + (estimate.time_offset_s - given.time_offset_s) / to_middle_s
+    if not estimate.determined or factor <= 0:
+        return None
+    apart = abs(np.log(factor / lengths.scale))
+    return factor if apart < 2 * np.hypot(lengths.std, estimate.std_s / abs(to_middle_s)) else None
 
 
 def _clock_agrees(alignment: VisualInertialAlignment | None, profile: CameraProfile) -> bool:
