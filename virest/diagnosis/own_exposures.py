@@ -213,8 +213,8 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
 
     A table that is off has no free number besides its rows, and exposures that follow the light have none.  They are
     the better account if they remove as much as a rival of a delay of each frame must.  With other rows, nothing may be
-    left in the points that was not before; with exposures as exact as measured brightness, no gain of the light and no
-    delay of frames.
+    left in the points that was not before; with exposures of their own, no delay of frames, and no gain of the light if
+    they follow the brightness: those that the delays show were compensated by an ISO that the log lacks as well.
     """
     delay = delay_of_frames(found)
     nominal = found.nominal
@@ -223,7 +223,9 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
     gain = replace(held_out, after=_points_left_px(given), noise=given.nominal.geometry_noise_px)
     if (gain.gain or 0.0) < RIVAL_GAIN_FRACTION * (held_out.gain or 0.0):
         return found
-    remains = any(cause.name == "gain_drift" for cause in given.causes) or delay_of_frames(given) is not None
+    of_brightness = own.p_value is not None
+    drifts = of_brightness and any(cause.name == "gain_drift" for cause in given.causes)
+    remains = drifts or delay_of_frames(given) is not None
     if remains if own.gain else given.unexplained.significant and not found.unexplained.significant:
         return found
     if own.gain:
@@ -231,7 +233,6 @@ def with_own_exposures_told(found: Diagnosis, given: Diagnosis, own: OwnExposure
     points = f"(points {gain.before:.3f} px → {gain.after:.3f} px): with its own, each frame is where the points are"
     if own.gain:
         size = max(own.gain, key=lambda g: abs(g - 1)) - 1
-        of_brightness = own.p_value is not None
         p_value = own.p_value if delay is None or of_brightness else delay.p_value
         told = FieldFinding(
             ("exposure",), UNLOGGED, f"as the {'brightness' if of_brightness else 'delays of frames'}",
