@@ -63,6 +63,22 @@ def test_indistinguishable_gyroscope_scale_and_focal_length_are_both_named() -> 
     assert "cannot tell them apart" in found.taken[0]
 
 
+def test_a_distortion_that_the_profile_lacks_is_found() -> None:
+    """Its coefficient is right, focal length and principal point stay, and no other cause is reported."""
+    recording = recorded(replace(HAND, k1=-0.12))
+    lens = recording.profile.intrinsics
+    assert lens is not None
+    plain = replace(lens, model="none", coefficients=())
+    found = settled(recording, replace(recording.profile, intrinsics=plain))
+    (text,) = found.taken
+    assert "radial distortion" in text
+    kept = found.profile.intrinsics
+    assert kept is not None
+    assert kept.coefficients[0] == pytest.approx(-0.12, abs=0.005)
+    assert (kept.fx_px, kept.fy_px, kept.cx_px, kept.cy_px) == (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
+    assert found.after_px < 1.2 * found.noise_px < found.before_px
+
+
 @pytest.mark.parametrize("fraction", [0.2])
 def test_an_unlisted_stabiliser_is_found(fraction: float) -> None:
     """Fraction and cutoff are right, and no other cause is reported."""

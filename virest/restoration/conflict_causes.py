@@ -9,7 +9,7 @@ import numpy as np
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.effects.changes import mean_gyro_scale
+from virest.effects.changes import k1_of, mean_gyro_scale
 from virest.effects.table import GYRO_SCALE_OFF
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
@@ -25,6 +25,8 @@ FRACTIONS, CUTOFF_STEPS = (0.25, 0.5, 0.8), (-1.2, 0.0, 1.2)
 """Stabilisers tried: fractions, and cutoffs as logarithms of factors on the profile's."""
 GYRO_REACH, GYRO_STEPS = 0.14, 8
 """Gyroscope scales tried: the range of the logarithm, that of plausible errors, and their number."""
+K1_REACH, K1_STEPS = 0.3, 7
+"""Radial distortions tried: the range of the first coefficient, that of wide phone lenses, and their number."""
 MOST_STABILISED = 0.95
 """No lens cancels more of the shake than this: such frames were cropped and rotated by software."""
 HIGHEST_CUTOFF_HZ = 15.0
@@ -108,6 +110,25 @@ def _with_gyro_scale(profile: CameraProfile, found: CameraProfile, std: Array) -
     return profile.with_estimate("gyro_scale", list(scale), spread, SOURCE, gyro_scale=scale)
 
 
+def _distortions(_: TrackTable) -> Array:
+    return np.linspace(-K1_REACH, K1_REACH, K1_STEPS)[:, None]
+
+
+def _with_distortion(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+    assert profile.intrinsics is not None
+    assert found.intrinsics is not None
+    lens = replace(profile.intrinsics, model=found.intrinsics.model, coefficients=found.intrinsics.coefficients)
+    return profile.with_estimate("k1", k1_of(found), float(std[0]), SOURCE, intrinsics=lens)
+
+
+def _is_lens(_: CameraProfile, found: CameraProfile) -> bool:
+    """Whether radii grow up to the corners: r (1 + k₁ r²) does while 1 + 3 k₁ r² is positive."""
+    lens = found.intrinsics
+    assert lens is not None
+    corner = np.array([lens.width / lens.fx_px, lens.height / lens.fy_px]) / 2
+    return abs(k1_of(found)) < 2 * K1_REACH and 1 + 3 * k1_of(found) * float(corner @ corner) > 0
+
+
 def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
     ext = found.extensions
     return 0 < ext.stabilisation_fraction < MOST_STABILISED and ext.stabilisation_cutoff_hz < HIGHEST_CUTOFF_HZ
@@ -151,6 +172,18 @@ CAUSES = (
         _with_skew,
         lambda given, found, std: (
             f"clock skew of {found.clock_skew:+.5f} ± {std[0]:.5f} used instead of the profile's {given.clock_skew:+g}"
+        ),
+    ),
+    Cause(
+        "radial distortion",
+        terms_of.K1,
+        _distortions,
+        _is_lens,
+        lambda given, found: k1_of(found) - k1_of(given),
+        _with_distortion,
+        lambda given, found, std: (
+            f"radial distortion of k1 = {k1_of(found):+.4f} ± {std[0]:.4f} used "
+            f"instead of the profile's {k1_of(given):+g}"
         ),
     ),
     Cause(

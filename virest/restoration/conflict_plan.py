@@ -109,8 +109,8 @@ def estimated_offset(offset_s: float, std_s: float) -> str:
 def _unexplained(found: Settled) -> str:
     return (
         f"tracked points lie {found.before_px:.2f} px from the profile's prediction (tracking noise "
-        f"{found.noise_px:.2f} px), and no focal length, readout, gyroscope scale, clock skew or stabiliser explains "
-        "it: virest diagnose"
+        f"{found.noise_px:.2f} px), and no focal length, distortion, readout, gyroscope scale, clock skew or "
+        "stabiliser explains it: virest diagnose"
     )
 
 

@@ -1,4 +1,4 @@
-"""Test a profile on tracked points, and correct a wrong focal length, readout, clock skew, gyroscope or stabiliser.
+"""Test a profile on tracked points, and correct a wrong lens, readout, clock skew, gyroscope or stabiliser.
 
 If points lie farther from the profile's prediction than tracking noise explains, each cause is fitted, together with
 the values that any profile may have slightly wrong (clock, bias, axes, readout).  The cause that best predicts held-out
@@ -22,7 +22,7 @@ from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.observed_tracks import ObservedTracks
-from virest.inference.profile_terms import CLOCK_SKEW, STATED_READOUT, UNKNOWN_READOUT, careful_terms, shift_offset
+from virest.inference.profile_terms import CLOCK_SKEW, K1, STATED_READOUT, UNKNOWN_READOUT, careful_terms, shift_offset
 from virest.inference.robust import RAYLEIGH_MEDIAN
 from virest.inference.time_blocks import even_blocks, halves
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
@@ -42,8 +42,8 @@ MOST_LEFT = 0.5
 HELD_OUT_P = 0.05
 """Significance level, one-sided, of the mean gain on held-out blocks (Student's t): a fit must predict other blocks."""
 VALUE_P = 1e-5
-"""Significance level of a value, with the tracking bias included in its deviation: with at most nine trials, a false
-cause is found in fewer than one capture of ten thousand."""
+"""Significance level of a value, with the tracking bias included in its deviation: with at most twelve trials, a
+false cause is found in about one capture of ten thousand."""
 READOUT_DOUBT_S = 0.001
 """Replace a stated readout time that differs by at least this much, s: the first and last rows are then displaced by
 the path of half of it, half a pixel at a hand's 1 rad/s and 1000 px.  Of 26 captures with the right one (20 simulated
@@ -51,9 +51,12 @@ outside, as phones film, and 6 real) none differs by more than 3.7 deviations.""
 TOLD_SIGMA = 3.0
 """A cause is distinguished from its twin if, fitted beside it, it remains above this many standard deviations."""
 MAX_CAUSES = 3
-"""Of the four causes, two of which are twins.  Their rounds have 4 + 3 + 2 trials."""
+"""Of the five causes, two of which are twins.  Their rounds have 5 + 4 + 3 trials."""
 JUDGED = 2
 """Number of causes with plausible values tested on held-out blocks in each round, those that fit best."""
+MOST_BENT = 0.2
+"""Largest residual, as a part of the points' motion, that a distortion can cause: k₁ changes motion along the radius by
+3 k₁ r², 0.2 for −0.3 at r = 0.5.  Beyond it, focal length and distortion explain another recording's gyroscope."""
 BLOCKS = 8
 """Time blocks.  Student's t at HELD_OUT_P is then 1.89; with half as many blocks 2.35, with twice as many 1.75."""
 POINTS, START_POINTS, STARTS = 1500, 400, 2
@@ -272,7 +275,10 @@ class _Search:
     def _next(self, here: _Start, fit: TrackFit) -> tuple[_Start, TrackFit] | None:
         """The cause with a plausible value that predicts held-out blocks best, if significantly better than none."""
         fitted = {term.name for term in (*self.nuisances, *(cause.term for cause in here.causes))}
-        open_causes = [cause for cause in CAUSES if cause.term.name not in fitted]
+        left = fit.scale * float(np.median(self.table.noise_px)) / _motion_px(self.table)
+        open_causes = [
+            cause for cause in CAUSES if cause.term.name not in fitted and (cause.term is not K1 or left < MOST_BENT)
+        ]
         tried = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
         better = [one for one in tried if one[1].cost < fit.cost and one[1].scale < fit.scale and self._has_value(*one)]
         judged = sorted(better, key=lambda one: one[1].cost)[:JUDGED]
