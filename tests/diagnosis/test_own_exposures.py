@@ -172,6 +172,7 @@ def test_light_that_changes_is_no_exposure() -> None:
         gain, setup = np.exp(rng.normal(0, 0.2, 45)), replace(ALTERNATING, seed=seed)
         assert _unlogged(gain, setup=setup) is None
         assert _unlogged(gain, tuple(range(45)), setup) is None
+        assert _unlogged(np.full(45, 1.02), setup=setup) is None
 
 
 def test_unlogged_exposures_are_the_finding_if_they_leave_no_gain() -> None:
@@ -189,6 +190,10 @@ def test_unlogged_exposures_are_the_finding_if_they_leave_no_gain() -> None:
     assert not told.causes
     assert with_own_exposures_told(found, replace(given, causes=(drift,)), own) is found
     assert with_own_exposures_told(found, replace(given, fields=found.fields), own) is found
+    by_delays = with_own_exposures_told(found, replace(given, causes=(drift,)), OwnExposures(gain=own.gain))
+    assert by_delays.causes == (drift,)  # the ISO that compensates
+    assert "as frames are late" in by_delays.fields[0].sentence
+    assert by_delays.fields[0].p_value == 1e-9
     profile = own.on(CameraProfile(640, 480).with_extensions(exposure_gain=(2.0,)))
     assert profile.extensions.exposure_gain == pytest.approx((1.2, 1.45, 0.6))
     scale = Finding("exposure_time", {}, HeldOutGain("blur_rms_px", 2.0, 1.0, 1.0), (), 0.0, "")
