@@ -6,7 +6,7 @@ the frames.  Camera translation and scene depth are estimated where the capture 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -64,7 +64,7 @@ from virest.restoration.conflict_plan import (
     explains_points,
     settle,
 )
-from virest.restoration.frame_time_plan import find_frame_times, for_own_exposures
+from virest.restoration.frame_time_plan import FrameTimes, find_frame_times, for_own_exposures
 from virest.restoration.lag_plan import GrayReader, at_lag, find_lag, with_lag
 from virest.restoration.neighbour_plan import with_neighbour_survey
 from virest.restoration.neighbours.survey import store_lumas, survey_runs
@@ -114,6 +114,9 @@ def _planned(
     read_gray: GrayReader,
     coding: Mapping[int, FrameCoding],
 ) -> RestorationPlan:
+    def planned(capture: Capture, profile: CameraProfile) -> RestorationPlan:
+        return _planned(capture, profile, settings, read_gray, coding)
+
     plan = RestorationPlan(
         profile, settings, _default_notes(profile, capture), None, capture.imu_gaps_s, applied_extensions(profile)
     )
@@ -155,15 +158,9 @@ def _planned(
         plan = settled
     if plan.refusal is None:
         times = find_frame_times(plan, profile, capture, tracked, lambda n: track_pairs(read_gray(n), guide=guide))
-        if times is not None:
-            again = _planned(times.capture, times.profile, settings, read_gray, coding)
-            if times.explain(plan, again):
-                if times.instead is not None:
-                    other = _planned(times.instead.capture, times.instead.profile, settings, read_gray, coding)
-                    own = times.instead.noted(other)
-                    if times.instead.explain(plan, other) and _lengths_prefer(own, times.noted(again), capture, powers):
-                        return own
-                return times.noted(again)
+        retimed = None if times is None else _retimed(plan, times, capture, powers, planned)
+        if retimed is not None:
+            return retimed
     if plan.refusal is None and not _clock_agrees(alignment, plan.profile):
         resting = _through_resting_lens(tracked, capture, plan.profile)
         agreement = check_agreement(observe_tracks(capture, resting, plan.profile), capture.imu, plan.profile)
@@ -188,8 +185,7 @@ def _planned(
     plan = _without_false_defocus(plan, capture, lumas)
     plan, lengths = _with_blur_length_check(plan, profile, capture, powers)
     if lengths is not None and (scale := _exposure_of_points(plan, profile, capture, tracked, lengths)) is not None:
-        shutter = replace(profile.shutter, exposure_scale=scale * profile.shutter.exposure_scale)
-        again = _planned(capture, replace(profile, shutter=shutter), settings, read_gray, coding)
+        again = planned(capture, profile.with_shutter(exposure_scale=scale * profile.shutter.exposure_scale))
         if again.refusal is None and again.contradicted is None:
             text = (
                 f"blur and tracked points show exposures of {scale:.2f} times the profile's, which are used instead: "
@@ -315,6 +311,25 @@ def _with_motion(
         )
         for index in sorted(powers)
     ]
+
+
+def _retimed(
+    plan: RestorationPlan,
+    times: FrameTimes,
+    capture: Capture,
+    powers: Mapping[int, TilePowers],
+    planned: Callable[[Capture, CameraProfile], RestorationPlan],
+) -> RestorationPlan | None:
+    """The plan with the frames' true times, or with the exposures that delay them as much; None: no better."""
+    by_stamps, other = planned(times.capture, times.profile), times.instead
+    if not times.explain(plan, by_stamps):
+        return None
+    by_stamps = times.noted(by_stamps)
+    if other is None:
+        return by_stamps
+    by_exposures = planned(other.capture, other.profile)
+    explained, by_exposures = other.explain(plan, by_exposures), other.noted(by_exposures)
+    return by_exposures if explained and _lengths_prefer(by_exposures, by_stamps, capture, powers) else by_stamps
 
 
 def _lengths_prefer(

@@ -120,8 +120,8 @@ def find_frame_times(
         found = (fit_frame_delays(turns) if turns is not None else None) or found
     if own := _own_exposures(capture, observed, profile, found):
         text = f"{_described(own, bright=True)}: each frame is restored with its own"
-        most_left = MOST_LEFT if late else None
-        return FrameTimes(replace(capture, frames=own.of(capture.frames)), given, text, own, None, most_left)
+        corrected = replace(capture, frames=own.of(capture.frames))
+        return FrameTimes(corrected, given, text, own, most_left=MOST_LEFT if late else None)
     if not late:
         return None
     text = (
@@ -129,14 +129,13 @@ def find_frame_times(
         "which are used instead"
     )
     text += f" in the first {MOST_FRAMES} frames" if len(usable) > MOST_FRAMES else ""
-    # a frame more, which has no delay, since beyond its last knot a field is constant
     instead = None
     if own := _exposures_by_delays(capture, observed, profile, found):
         said = f"{_described(own)}: each frame is restored with its own"
         instead = FrameTimes(replace(capture, frames=own.of(capture.frames)), given, said, own)
-    return FrameTimes(
-        capture, _with_delays(given, profile, capture, usable[: MOST_FRAMES + 1], found), text, instead=instead
-    )
+    # a frame more, which has no delay, since beyond its last knot a field is constant
+    delayed = _with_delays(given, profile, capture, usable[: MOST_FRAMES + 1], found)
+    return FrameTimes(capture, delayed, text, instead=instead)
 
 
 def _exposures_by_delays(
@@ -150,10 +149,11 @@ def _exposures_by_delays(
     to_middle = 0.5 - STAMP_FRACTION[profile.shutter.timestamp]
     if not to_middle or any(frame.exposure_s is None for frame in capture.frames):
         return AS_LOGGED
-    own = AS_LOGGED
     found: FrameDelays | None = delays
     gain = np.ones(len(capture.frames))
-    for _ in range(DELAY_PASSES):
+    for number in range(DELAY_PASSES):
+        if number:
+            found = _delays_with(OwnExposures(gain=tuple(gain.tolist())), capture, observed, profile)
         if found is None or len(found.frame) < MIN_PAIRS:
             return AS_LOGGED
         trend = np.polynomial.Polynomial.fit(found.frame, found.late_s, 1)
@@ -162,9 +162,7 @@ def _exposures_by_delays(
         gain[found.frame] += longer_s / profile.shutter.true_exposure_s(logged_s)
         if gain.min() < LEAST_EXPOSURE:
             return AS_LOGGED
-        own = OwnExposures(gain=tuple(gain.tolist()))
-        found = _delays_with(own, capture, observed, profile)
-    return own if gain.std() > LEAST_GAIN_STD else AS_LOGGED
+    return OwnExposures(gain=tuple(gain.tolist())) if gain.std() > LEAST_GAIN_STD else AS_LOGGED
 
 
 def _delays_with(
