@@ -869,8 +869,8 @@ def test_slopes_of_single_frames_delays_are_those_of_difference_quotients() -> N
     for known in (frozenset(), frozenset({"time_offset", "clock_skew"})):
         form = form_of_late_frames(phone.capture, phone.profile, span_s, phone.stamp_s, known)
         assert form is not None
-        quick = slopes_of(form.term, phone.profile, table, seen.moved_by)
-        plain = slopes_of(replace(form.term, slopes=None), phone.profile, table, seen.moved_by)
+        quick = slopes_of([form.term], seen.changes)
+        plain = slopes_of([replace(form.term, slopes=None)], seen.changes)
         np.testing.assert_allclose(quick, plain, atol=1e-3 * np.abs(plain).max())
 
 

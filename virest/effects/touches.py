@@ -22,10 +22,13 @@ class Touched:
     """The rotation from IMU to camera: rotate trajectory and path."""
     lens: bool
     """The lens, or its motion."""
+    only_motion: bool
+    """Nothing but rates and axes."""
 
 
-RATES, AXES, LENS, NOTHING = "rates", "axes", "lens", "nothing"
+RATES, AXES, LENS, NOTHING, EVERYTHING = "rates", "axes", "lens", "nothing", "everything"
 OF_PROFILE = {
+    **dict.fromkeys(("gyro_bias_rad_s", "gyro_scale"), RATES),
     "r_cam_imu": AXES,
     "intrinsics": LENS,
     # when a point is seen, and how bright: each prediction reads these from the profile
@@ -36,6 +39,7 @@ OF_PROFILE = {
 }
 """Profile fields that do not invalidate everything."""
 OF_EXTENSIONS = {
+    **dict.fromkeys(("gyro_lowpass_hz", "gyro_averaging_s", "gyro_misalignment_rad"), RATES),
     **dict.fromkeys(("focal_drift_per_s", "stabilisation_fraction", "stabilisation_cutoff_hz"), LENS),
     "stabilisation_lean_rad": LENS,
     **dict.fromkeys(("frame_lag_s", "frame_lag_frames"), NOTHING),
@@ -50,16 +54,17 @@ OF_FIELDS = {"rate": RATES, "scale": LENS, "delay": NOTHING, "gain": NOTHING, "b
 
 def touched(before: CameraProfile, after: CameraProfile) -> Touched:
     """What differs between the predictions of two profiles."""
-    found = {OF_PROFILE.get(name, RATES) for name in _changed(before, after) if name != "extensions"}
+    found = {OF_PROFILE.get(name, EVERYTHING) for name in _changed(before, after) if name != "extensions"}
     if before.extensions is not after.extensions:
         changed = _changed(before.extensions, after.extensions)
-        found |= {OF_EXTENSIONS.get(name, RATES) for name in changed if name != "field"}
+        found |= {OF_EXTENSIONS.get(name, EVERYTHING) for name in changed if name != "field"}
         if "field" in changed:
-            found |= {OF_FIELDS.get(kind, RATES) for kind in _changed_kinds(before, after)}
+            found |= {OF_FIELDS.get(kind, EVERYTHING) for kind in _changed_kinds(before, after)}
     # fields over logged covariates are on the camera clock: on the IMU clock they move with the clocks
     logged = any(field.log is not None for field in after.extensions.field)
     later = logged and _clocks(before) != _clocks(after)
-    return Touched(RATES in found, AXES in found, LENS in found or later)
+    rates, only_motion = not found.isdisjoint({RATES, EVERYTHING}), found <= {RATES, AXES} and not later
+    return Touched(rates, AXES in found, LENS in found or later, only_motion)
 
 
 def _clocks(profile: CameraProfile) -> tuple[Any, ...]:

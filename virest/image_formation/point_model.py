@@ -282,14 +282,13 @@ def predict(
     like: an earlier prediction of the same table, whose unaffected parts are reused.
     """
     poses, sights = _poses(known, table, like), _sights(known.lens, table, like)
-    at_rest = known.lens.rays_at_rest(table.first_px, poses.first_s) if sights is None else sights.rays
-    world = poses.before.to_world(known.lens.from_rest(at_rest, poses.first_s, poses.first_exposure_s))
+    world = world_rays(known, table, poses, sights)
     if scene is None or isinstance(scene, DirectedMotion):
         rays = poses.after.to_camera(world)
         expected = poses.again(known.lens, rays)
         if scene is None:
             return Prediction(expected, poses, sights=sights)
-        per_step = poses.after.per_world(_lens_slope(known.lens, rays, poses, expected))
+        per_step = poses.after.per_world(lens_slope(known.lens, rays, poses, expected))
         step = scene.direction[scene.group(table.pair)]
         along = np.squeeze(per_step @ step[..., None], -1)
         return Prediction(expected, poses, along, per_step=per_step, sights=sights)
@@ -297,6 +296,12 @@ def predict(
     paths = paths or _paths(known, table, scene, poses)
     seen = _seen_again(known, world, poses, _moved_inertially(table, scene, world, paths, slopes))
     return replace(seen, sights=sights)
+
+
+def world_rays(known: IntegratedMotion, table: TrackTable, poses: Poses, sights: Sightings | None) -> Array:
+    """Rays (n, 3) through the first points, world axes."""
+    at_rest = known.lens.rays_at_rest(table.first_px, poses.first_s) if sights is None else sights.rays
+    return poses.before.to_world(known.lens.from_rest(at_rest, poses.first_s, poses.first_exposure_s))
 
 
 def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sightings | None:
@@ -311,7 +316,7 @@ def _sights(lens: MovingLens, table: TrackTable, like: Prediction | None) -> Sig
     return Sightings(lens.lens, lens.lens.rays(table.first_px))
 
 
-def _lens_slope(lens: MovingLens, rays: Array, poses: Poses, expected: Array) -> Array:
+def lens_slope(lens: MovingLens, rays: Array, poses: Poses, expected: Array) -> Array:
     """Change (n, 2, 3) of pixels per unit of each part of rays (n, 3)."""
     steps = poses.again(lens, rays + RAY_STEP * np.eye(3)[:, None])
     return np.ascontiguousarray(np.moveaxis((steps - expected) / RAY_STEP, 0, -1))
@@ -385,7 +390,7 @@ def _seen_again(known: IntegratedMotion, world: Array, poses: Poses, moved: Move
     if moved.per_entry is None:
         ahead = rays + RAY_STEP * poses.after.to_camera(moved.step)
         return Prediction(expected, poses, (poses.again(known.lens, ahead) - expected) / RAY_STEP, None, moved)
-    per_world = poses.after.per_world(_lens_slope(known.lens, rays, poses, expected))
+    per_world = poses.after.per_world(lens_slope(known.lens, rays, poses, expected))
     along = np.squeeze(per_world @ moved.step[..., None], -1)
     return Prediction(expected, poses, along, per_world @ moved.per_entry, moved)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
+from virest.image_formation.point_changes import Moved, PointChanges
 from virest.image_formation.point_model import TrackTable
 
 
@@ -25,7 +26,7 @@ class Term:
     """(k,) largest change in one iteration."""
     prior_std: tuple[float, ...]
     """(k,) prior standard deviation of the total change from the starting profile; inf: no prior."""
-    slopes: Callable[[CameraProfile, TrackTable, Callable[[CameraProfile], Array]], Array] | None = None
+    slopes: Callable[[CameraProfile, TrackTable, Moved], Array] | None = None
     """All slopes (n, 2, k) at once, if that is faster, from a profile, the points, and a function that gives their
     displacement (n, 2) for another profile; None: by difference quotients."""
 
@@ -33,15 +34,20 @@ class Term:
         return len(self.quotient)
 
 
-def slopes_of(
-    term: Term, profile: CameraProfile, table: TrackTable, moved_by: Callable[[CameraProfile], Array]
-) -> Array:
-    """Change (n, 2, k) of predicted points per unit of a term's values; moved_by: displacement for another profile."""
-    if term.slopes is not None:
-        return term.slopes(profile, table, moved_by)
-    columns = []
-    for k, quotient in enumerate(term.quotient):
-        step = np.zeros(len(term))
-        step[k] = quotient
-        columns.append(moved_by(term.change(profile, step)) / quotient)
-    return np.stack(columns, axis=-1) if columns else np.zeros((len(table), 2, 0))
+def slopes_of(terms: Sequence[Term], at: PointChanges) -> Array:
+    """Change (n, 2, k) of predicted points per unit of each term's values."""
+    profile, table = at.known.profile, at.table
+    changed = [
+        term.change(profile, quotient * np.eye(len(term))[k])
+        for term in terms
+        if term.slopes is None
+        for k, quotient in enumerate(term.quotient)
+    ]
+    moved, begin, found = at.by_each(changed), 0, [np.zeros((len(table), 2, 0))]
+    for term in terms:
+        if term.slopes is not None:
+            found.append(term.slopes(profile, table, at.by))
+        else:
+            found.append(moved[:, :, begin : begin + len(term)] / np.array(term.quotient))
+            begin += len(term)
+    return np.concatenate(found, axis=-1)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from virest.arrays import Array
-from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.image_formation.point_changes import PointChanges
 from virest.image_formation.point_model import IntegratedMotion, Prediction, TrackTable, predict, with_profile
 from virest.inference.descent import Slopes, System, slices
 from virest.inference.fit_start import FitStart
@@ -135,13 +135,7 @@ class TrackEvidence:
 
     def _term_slopes(self, state: State, at: Prediction, terms: tuple[Term, ...] | None = None) -> Array:
         """(n, 2, k) change of the predicted points per unit of each term's values; terms: None for all."""
-
-        def moved_by(profile: CameraProfile) -> Array:
-            moved = with_profile(state.known, self.imu, profile)
-            return predict(moved, self.table, state.scene, like=at).second_px - at.second_px
-
-        found = [slopes_of(term, state.known.profile, self.table, moved_by) for term in terms or self.terms]
-        return np.concatenate(found, axis=-1) if found else np.zeros((len(self.table), 2, 0))
+        return slopes_of(terms or self.terms, PointChanges(self.imu, state.known, self.table, state.scene, at))
 
     def weighed(self, state: State, look: Linearisation) -> TrackSystem:
         """Whiten a look's rows by noise and spread of depths, and eliminate the directions of travel."""

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.motion.trajectory import Trajectory
+from virest.motion.trajectory import Trajectory, Turning, cross, hermite
 
 MIN_FINITE = 0.98
 """Smallest fraction of the rows with an acceleration; gaps are interpolated."""
@@ -56,6 +56,25 @@ class Displacement:
         pieces = self.spline.c @ rows.T
         spline = CubicHermiteSpline.construct_fast(pieces, self.spline.x, self.spline.extrapolate, self.spline.axis)
         return Displacement(trajectory, spline, self.arm_cam_m)
+
+    def turned_by(
+        self, turning: Turning, force: Array, force_change: Array, time_s: Array, origin_s: Array, window: Index
+    ) -> Array:
+        """To first order, the change (n, 3, k) of the centre at times (n,) due to small rotations of the camera.
+
+        force (m, 3), force_change (m, 3, k): specific force at the trajectory's knots, m/s², camera axes, and changes
+        of it.  From rest at origin_s (w,) of each window.
+        """
+        way, shape = self.trajectory, (-1, *turning.at_knots.shape[1:])
+        to_world = way.rotation_world_cam
+        pushed = cross(turning.at_knots, to_world @ force[..., None]) + to_world @ force_change
+        path = _integrated_twice(way.time_s, pushed.reshape(len(pushed), -1))
+        begun, speed = path(origin_s)[window], path(origin_s, 1)[window]
+        moved = (path(time_s) - begun - speed * (time_s - origin_s[window])[:, None]).reshape(shape)
+        if self.arm_cam_m.any():
+            now, begun = (cross(turning.at(t), self._arm(t)[..., None]) for t in (time_s, origin_s))
+            moved += now - begun[window]
+        return np.asarray(moved)
 
     def _arm(self, time_s: Array) -> Array:
         """Camera's centre relative to the IMU, world axes: −R_world_cam p_cam_imu."""
@@ -99,12 +118,9 @@ def integrate_accelerometer(
 
 
 def _integrated_twice(time_s: Array, rate: Array) -> CubicHermiteSpline:
-    """The spline through positions and velocities; its pieces as SciPy computes them, without its checks and copies."""
+    """The spline (k values) of the double integral of a rate (n, k), from rest."""
     step, velocity, position = np.diff(time_s)[:, None], np.zeros_like(rate), np.zeros_like(rate)
     np.cumsum(0.5 * step * (rate[:-1] + rate[1:]), axis=0, out=velocity[1:])
     moved = velocity[:-1] * step + step**2 * (2 * rate[:-1] + rate[1:]) / 6
     np.cumsum(moved, axis=0, out=position[1:])
-    begin, slope = velocity[:-1], np.diff(position, axis=0) / step
-    bend = (begin + velocity[1:] - 2 * slope) / step
-    pieces = np.stack([bend / step, (slope - begin) / step - bend, begin, position[:-1]])
-    return CubicHermiteSpline.construct_fast(pieces, time_s, True, 0)
+    return hermite(time_s, position, velocity)

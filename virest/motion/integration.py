@@ -19,10 +19,7 @@ def integrate_gyro(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRa
     the result of :func:`measured_rate`, if already known.  The profile's low-pass filter is undone.  Raises ImuError
     for fewer than two samples.
     """
-    polynomials = _camera_rate(measured or measured_rate(imu), profile)
-    if (missing := missing_rate_rad_s(imu, profile)) is not None:
-        polynomials[2] += profile.rotation_cam_imu @ (np.diff(missing, axis=0).T / np.diff(imu.time_s))
-        polynomials[3] += profile.rotation_cam_imu @ missing[:-1].T
+    polynomials = camera_rate(imu, profile, measured or measured_rate(imu))
     steps = rotation_from_vector(turned_angle(polynomials, np.diff(imu.time_s)).T)
     return Trajectory(imu.time_s, _running_product(steps), polynomials)
 
@@ -42,12 +39,19 @@ def missing_rate_rad_s(imu: ImuSamples, profile: CameraProfile) -> Array | None:
     return np.asarray(sum(field.at(*(known[name] for name in field.covariates)) for field in fields))
 
 
-def _camera_rate(measured: MeasuredRate, profile: CameraProfile) -> Array:
-    """True rate in camera axes, pieces (4, 3, n − 1): R_cam_imu ((I + Γ) S)⁻¹ (measured, its filter undone, − bias)."""
+def camera_rate(imu: ImuSamples, profile: CameraProfile, measured: MeasuredRate) -> Array:
+    """True rate in camera axes, pieces (4, 3, n − 1) as in :class:`Trajectory`.
+
+    R_cam_imu (((I + Γ) S)⁻¹ (measured, its filter undone, − bias) + fields of kind ``rate``).
+    """
     extensions = profile.extensions
     unbiased = measured.before_filter(extensions.gyro_lowpass_hz, extensions.gyro_averaging_s).copy()
     unbiased[3] -= np.array(profile.gyro_bias_rad_s)[:, None]
-    return np.asarray(profile.rotation_cam_imu @ profile.gyro_correction @ unbiased)
+    polynomials = np.asarray(profile.rotation_cam_imu @ profile.gyro_correction @ unbiased)
+    if (missing := missing_rate_rad_s(imu, profile)) is not None:
+        polynomials[2] += profile.rotation_cam_imu @ (np.diff(missing, axis=0).T / np.diff(imu.time_s))
+        polynomials[3] += profile.rotation_cam_imu @ missing[:-1].T
+    return polynomials
 
 
 def _running_product(steps: Array) -> Array:

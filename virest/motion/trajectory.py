@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from virest.arrays import Array, Index
 
@@ -64,11 +65,46 @@ class Trajectory:
         both = angle + bend + 0.5 * _cross(angle, bend)
         return Orientations(self.rotation_world_cam.take(interval, axis=0), _exponential(*both))
 
+    def turned_by(self, rate_polynomials: Array) -> Turning:
+        """To first order, the rotations due to further rates (4, 3, n − 1, k), in camera axes."""
+        step_s, start = np.diff(self.time_s), rate_polynomials[3]
+        a, b, c, d = rate_polynomials
+        h = step_s[:, None]
+        angle = h * (d + h * (c / 2 + h * (b / 3 + h * (a / 4))))
+        last = ((a[:, -1] * h[-1] + b[:, -1]) * h[-1] + c[:, -1]) * h[-1] + d[:, -1]
+        rate = np.concatenate([start, last[:, None]], axis=1)
+        rotation = self.rotation_world_cam
+        turned = np.zeros((len(self.time_s), 3, rate_polynomials.shape[-1]))
+        np.cumsum(0.5 * (rotation[:-1] + rotation[1:]) @ np.moveaxis(angle, 1, 0), axis=0, out=turned[1:])
+        return Turning(self.time_s, turned, rotation @ np.moveaxis(rate, 1, 0))
+
     def _locate(self, time_s: Array) -> tuple[Index, Array]:
         """Interval of each time (...), and the seconds since its knot (...). Times beyond the knots are clipped."""
         held = np.minimum(np.maximum(time_s, self.time_s[0]), self.time_s[-1])
         interval = np.minimum(np.maximum(self.time_s.searchsorted(held, "right") - 1, 0), len(self.time_s) - 2)
         return interval, held - self.time_s[interval]
+
+
+@dataclass(frozen=True, slots=True)
+class Turning:
+    """Small rotations θ of a camera about world axes, k at once: R becomes exp(θ) R."""
+
+    time_s: Array
+    """(n,) knots."""
+    at_knots: Array
+    """(n, 3, k) rotation vectors."""
+    rate: Array
+    """(n, 3, k) their change per second, world axes."""
+
+    def at(self, time_s: Array, exposure_s: Array | float = 0.0) -> Array:
+        """θ (m, 3, k) at times (m,), or averaged over exposures around them: θ + θ'' E² / 24, to second order."""
+        held = np.clip(time_s, self.time_s[0], self.time_s[-1])
+        flat = (part.reshape(len(part), -1) for part in (self.at_knots, self.rate))
+        spline = hermite(self.time_s, *flat)
+        found = spline(held)
+        if np.any(exposure_s):
+            found = found + spline(held, 2) * (np.asarray(exposure_s) ** 2 / 24)[..., None]
+        return np.asarray(found).reshape(-1, *self.at_knots.shape[1:])
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +135,20 @@ class Orientations:
         """Slopes (n, k, 3) with respect to camera axes, converted to world axes."""
         to_camera = np.swapaxes(self.knot @ self.since, -1, -2)
         return np.asarray(slopes @ np.ascontiguousarray(to_camera))  # products of transposed views take three times
+
+
+def hermite(time_s: Array, values: Array, slopes: Array) -> CubicHermiteSpline:
+    """The spline through values and slopes (n, k) at n times; its pieces as SciPy computes them, without its checks."""
+    step = np.diff(time_s)[:, None]
+    slope, begin = np.diff(values, axis=0) / step, slopes[:-1]
+    bend = (begin + slopes[1:] - 2 * slope) / step
+    pieces = np.stack([bend / step, (slope - begin) / step - bend, begin, values[:-1]])
+    return CubicHermiteSpline.construct_fast(pieces, time_s, True, 0)
+
+
+def cross(turned: Array, vectors: Array) -> Array:
+    """θ × v (n, 3, k) of rotations (n, 3, k) and vectors (n, 3, 1 or k)."""
+    return np.moveaxis(_cross(np.moveaxis(turned, 1, 0), np.moveaxis(vectors, 1, 0)), 0, 1)
 
 
 def turned(rotation: Array, rays: Array) -> Array:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from virest.arrays import Array
-from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.candidates import varies
 from virest.diagnosis.geometric_effects import PLAIN_READOUT
-from virest.image_formation.point_model import Prediction, TrackTable, predict, with_profile
+from virest.image_formation.point_changes import PointChanges
+from virest.image_formation.point_model import Prediction, TrackTable, predict
 from virest.inference import profile_terms as terms_of
 from virest.inference.term import Term, slopes_of
 from virest.inference.track_fit import TrackFit
@@ -55,7 +56,7 @@ class Whitening:
         return np.asarray(rows - self.way[:, :, None] * along[:, None, :])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PointResiduals:
     """Point residuals of a fit, ready for a regression."""
 
@@ -71,14 +72,12 @@ class PointResiduals:
 
     def effect(self, terms: Sequence[Term]) -> Array:
         """Whitened change (n, 2, k) of the predicted points per free number of terms."""
-        slopes = [slopes_of(term, self.fit.profile, self.table, self.moved_by) for term in terms]
-        return self.whitening.of(np.concatenate(slopes, axis=-1))
+        return self.whitening.of(slopes_of(terms, self.changes))
 
-    def moved_by(self, profile: CameraProfile) -> Array:
-        """Displacement (n, 2) of the predicted points under another profile, px."""
-        moved = with_profile(self.fit.integrated, self.imu, profile)
-        ahead = predict(moved, self.table, self.fit.scene, like=self.prediction)
-        return ahead.second_px - self.prediction.second_px
+    @cached_property
+    def changes(self) -> PointChanges:
+        """Displacements of the predicted points under other profiles."""
+        return PointChanges(self.imu, self.fit.integrated, self.table, self.fit.scene, self.prediction)
 
     def tangent(self) -> Array:
         """Whitened effect (n, 2, m) of all named causes and of the scene."""
@@ -95,7 +94,7 @@ class PointResiduals:
         if profile.extensions.stabilisation_fraction:
             return self.effect((terms_of.STABILISATION,))
         extensions = replace(profile.extensions, stabilisation_fraction=0.02, stabilisation_cutoff_hz=cutoff_hz)
-        return self.whitening.of(self.moved_by(replace(profile, extensions=extensions))[..., None] / 0.02)
+        return self.whitening.of(self.changes.by(replace(profile, extensions=extensions))[..., None] / 0.02)
 
 
 def point_residuals(imu: ImuSamples, fit: TrackFit, table: TrackTable) -> PointResiduals:

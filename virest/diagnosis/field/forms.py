@@ -10,10 +10,10 @@ import numpy as np
 from virest.arrays import Array, Index
 from virest.camera.field import FORCES, RATES, Field, cardinal_weights
 from virest.camera.profile import CameraProfile
+from virest.image_formation.point_changes import Moved
 from virest.image_formation.point_model import TrackTable
 from virest.inference.track_fit import Term
 
-Moved = Callable[[CameraProfile], Array]
 Recipe = Callable[[CameraProfile, frozenset[str]], "FieldForm"]
 """Builds a form from a profile and the names of the terms in the model."""
 SENSORS = {**dict.fromkeys(RATES, "rate"), **dict.fromkeys(FORCES, "acceleration")}
