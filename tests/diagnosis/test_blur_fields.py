@@ -16,6 +16,7 @@ from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Capture, CaptureMetadata, Frame
 from virest.diagnosis.field.blur import blur_field
+from virest.diagnosis.field.focus import FocusOverTime, blur_fields
 from virest.diagnosis.local_blur import LENS_SIGMA_PX, BlurObservations
 from virest.diagnosis.local_blur_edges import EdgeWidths
 from virest.diagnosis.local_blur_spectra import join_ratios
@@ -105,6 +106,16 @@ def test_a_moving_focus_gives_a_field_over_time() -> None:
         assert sharp.defocus_sigma_px < 0.5
         assert wide.defocus_sigma_px == pytest.approx(2.0, rel=0.2)
     assert finding.covariates == ("time",)
+
+
+def test_edges_that_widen_at_times_are_no_focus_where_spectra_show_that_it_rests() -> None:
+    """Denoising and coding of long blurs widen edges too."""
+    observations, capture = seen(2.0 * (focus_dioptres(WHEN) - 0.5) / 2)
+    trajectory = integrate_gyro(STILL, CAMERA)
+    unlogged = replace(capture, frames=tuple(replace(f, focus_dioptres=None) for f in capture.frames))
+    (told,), _ = blur_fields(observations, CAMERA, trajectory, unlogged)
+    assert told.covariates == ("time",)
+    assert blur_fields(observations, CAMERA, trajectory, unlogged, FocusOverTime(None)) == ([], CAMERA)
 
 
 def test_a_blur_field_adds_to_an_even_defocus() -> None:

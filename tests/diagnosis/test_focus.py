@@ -38,8 +38,9 @@ def found(folder: Path, blur_px: Callable[[float], float] | None, scene: str, de
     trajectory = integrate_gyro(capture.imu, profile)
     gray = GrayReader(capture.movie, probe_movie(capture.movie))
     seen = look_for_blur(gray, capture, profile, trajectory)
-    moving = moving_focus(gray, seen, profile, trajectory, capture)
-    return moving, *blur_fields(seen, profile, trajectory, capture, moving)
+    focus = moving_focus(gray, seen, profile, trajectory, capture)
+    moving = None if focus is None else focus.finding
+    return moving, *blur_fields(seen, profile, trajectory, capture, focus)
 
 
 @pytest.mark.parametrize("scene", ["photographs", "leaves"])

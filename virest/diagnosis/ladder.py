@@ -424,7 +424,7 @@ class DiagnosisSession:
                 light = replace(light, profile=with_light_field(light.profile, found))
         if self.blur.edges is not None:
             trajectory = integrate_gyro(self.capture.imu, extended)
-            soft, extended = blur_fields(self.blur.edges, extended, trajectory, self.capture, self.blur.moving)
+            soft, extended = blur_fields(self.blur.edges, extended, trajectory, self.capture, self.blur.focus)
             fields = [*fields, *soft]
             if soft:
                 uniform_px = (

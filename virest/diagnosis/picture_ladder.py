@@ -24,8 +24,8 @@ from virest.diagnosis.curve_from_blur import (
     judge_mixing,
     observe_mixing,
 )
-from virest.diagnosis.field.focus import moving_focus
-from virest.diagnosis.findings import BLUR, PHOTOMETRY, FieldFinding, Finding, HeldOutGain, ParameterChange, Rival, Rung
+from virest.diagnosis.field.focus import FocusOverTime, moving_focus
+from virest.diagnosis.findings import BLUR, PHOTOMETRY, Finding, HeldOutGain, ParameterChange, Rival, Rung
 from virest.diagnosis.isolated_steps import IsolatedSteps
 from virest.diagnosis.photometry import PhotometricObservations, normalised_rms
 from virest.diagnosis.photometry_effects import (
@@ -99,7 +99,7 @@ class PictureVerdict:
     blur_rms_px: float | None = None
     edges: local_blur.BlurObservations | None = None
     """The measured local blur."""
-    moving: FieldFinding | None = None
+    focus: FocusOverTime | None = None
     """Blur over time that spectra show."""
     steps: IsolatedSteps | None = None
     """Isolated steps of the frames in which blur was measured; None: not measured."""
@@ -436,8 +436,9 @@ def climb_blur(
             verdict.findings.append(Finding(name, changes, held, (), p_value, sentence_of(name, changes)))
             verdict.rungs.append(Rung(name, {name: held.after}, held.before, BLUR))
             verdict.profile = effects[k].apply(verdict.profile, np.array([change.estimate]))
-    verdict.moving = moving_focus(gray, observations, verdict.profile, trajectory, capture)
-    if verdict.moving is None and 1 not in named and fitted.determined[1]:
+    verdict.focus = moving_focus(gray, observations, verdict.profile, trajectory, capture)
+    moves = verdict.focus is not None and verdict.focus.finding is not None
+    if not moves and 1 not in named and fitted.determined[1]:
         verdict.notes += _softness(defocus, float(fitted.nuisance[0]), refused)
     return verdict, is_exposure
 

@@ -56,6 +56,7 @@ LEAST_TILES, LEAST_BINS, LEAST_IN_BIN = 5, 4, 3
 """Fewest tiles of a pair, bins of a tile, and tiles in which a bin of a pair is measured."""
 STEP_S, MOST_TIMES = 0.1, 100
 """Spacing of the compared frames: a focus motor takes 0.1 to 0.5 s for a move; and their largest number."""
+TIME = ("time",)
 APART = 1, 3, 9
 """Distances of compared frames, in steps: near pairs follow the motion, far ones keep errors from adding up."""
 LEAST_AS_DEFOCUS = 0.55
@@ -63,6 +64,14 @@ LEAST_AS_DEFOCUS = 0.55
 with unlogged exposures or a temporal denoiser 0.18 to 0.43."""
 NARROWEST = 0.2
 """Part of the edges that may be narrower than the blur of the sharpest frames, by noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class FocusOverTime:
+    """What the spectra of a whole capture show of a moving focus."""
+
+    finding: FieldFinding | None
+    """None: it rests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,20 +130,22 @@ def blur_fields(
     profile: CameraProfile,
     trajectory: Trajectory,
     capture: Capture,
-    moving: FieldFinding | None = None,
+    by_spectra: FocusOverTime | None = None,
 ) -> tuple[list[FieldFinding], CameraProfile]:
     """All blur fields that edges and spectra support, and the profile with them.
 
-    moving: that of :func:`moving_focus`.  It takes precedence over a blur of the edges over time, and a logged focus
-    distance over both.
+    by_spectra: that of :func:`moving_focus`.  It takes precedence over a blur of the edges over time, which coding of
+    long blurs and denoising cause too, and a logged focus distance over both.
     """
     by_edges = blur_field(seen, profile, trajectory, capture)
     covariates = () if by_edges is None else by_edges[0].covariates
-    found, own = ([], profile) if by_edges is None else ([by_edges[0]], by_edges[1])
+    if by_edges is None or (covariates == TIME and by_spectra is not None):
+        found, own = [], profile
+    else:
+        found, own = [by_edges[0]], by_edges[1]
+    moving = None if by_spectra is None else by_spectra.finding
     if moving is None or covariates == ("focus",):
         return found, own
-    if covariates == ("time",):
-        found, own = [], profile
     (field,) = moving.fields
     own = own.with_extensions(defocus_sigma_px=_even_px(seen, profile, trajectory, field))
     return [*found, moving], own.with_fields([*own.fields, field])
@@ -157,22 +168,30 @@ def _even_px(seen: BlurObservations, profile: CameraProfile, trajectory: Traject
 
 def moving_focus(
     gray: Reader, seen: BlurObservations, profile: CameraProfile, trajectory: Trajectory, capture: Capture
-) -> FieldFinding | None:
-    """The blur over time that spectra of frames support; None where they support none, or the capture is too long.
+) -> FocusOverTime | None:
+    """The blur over time that spectra of frames support; None where they were not compared, or the capture is too long.
 
-    Further frames are read only if the pairs that were measured for the exposure differ.
+    Further frames are read only if the pairs that were measured for the exposure differ, or widths of edges change.
     """
     first = _tiles(seen, profile, trajectory).pairs()
     squares = float(np.sum((first.change_px2 / first.std_px2) ** 2))
-    if not len(first.change_px2) or profile.over_time("blur") or chi2_tail(squares, len(first.change_px2)) > MAX_P:
-        return None
+    differ = len(first.change_px2) > 0 and chi2_tail(squares, len(first.change_px2)) <= MAX_P
     wanted = _frames(capture)
-    if len(wanted) > MOST_TIMES:
+    if profile.over_time("blur") or len(wanted) > MOST_TIMES:
         return None
+    if not differ:
+        by_edges = blur_field(seen, profile, trajectory, capture)
+        if by_edges is None or by_edges[0].covariates != TIME:
+            return None
     ratios = _compared(gray, wanted, capture, profile, trajectory)
     tiles = _tiles(replace(seen, ratios=ratios), profile, trajectory)
     found = _fitted(tiles.pairs())
-    if found is None or found.p_value > MAX_P:
+    return None if found is None else FocusOverTime(_finding(tiles, found, seen, capture))
+
+
+def _finding(tiles: _Tiles, found: _OverTime, seen: BlurObservations, capture: Capture) -> FieldFinding | None:
+    """The finding, if the changes are significant, look like a defocus, and hold in the other half of the picture."""
+    if found.p_value > MAX_P:
         return None
     lowest = np.argmin(found.variance_px2)
     alike = found.variance_px2 - found.variance_px2[lowest] < 2 * np.hypot(found.std_px2, found.std_px2[lowest])
