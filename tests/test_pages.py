@@ -22,7 +22,7 @@ from virest.app.gallery import gallery_page
 BLOCKS = [block for page in PAGES for block in pages.blocks(page)]
 MOST_S = {README: 30.0}
 """CPU time of the sessions that the tests run, by page; of other pages OTHERS_S."""
-OTHERS_S = 8.0
+OTHERS_S = 4.0
 SESSIONS = [block for block in BLOCKS if block.took_s is not None and block.took_s <= MOST_S.get(block.page, OTHERS_S)
             and not any("-m virest.app.bench" in command for command in block.commands)]  # fmt: skip
 """Blocks that the tests run. Longer ones and benches are left to `make readme`."""
