@@ -14,6 +14,7 @@ from virest.camera.profile import CameraProfile
 from virest.image_formation.point_changes import PointChanges
 from virest.image_formation.point_model import integrate_motion, predict
 from virest.inference.profile_terms import TERMS
+from virest.motion.scene_motion import DirectedMotion, Motion
 
 SETUPS = {
     **{name: (setup, False) for name, setup in FAR.items()},
@@ -35,6 +36,16 @@ def changed(profile: CameraProfile) -> dict[str, CameraProfile]:
         extensions = replace(profile.extensions, field=(field.with_values(0.02 * np.array(field.values)),))
         found[f"rate over {field.covariates[0]}"] = replace(profile, extensions=extensions)
     return found
+
+
+def test_directions_of_travel_do_not_move_points() -> None:
+    """A fit eliminates them: the displacements are those of a rotating camera."""
+    recording = recorded(FAR["portrait, read from the right"])
+    table, known = recording.table(), integrate_motion(recording.imu, recording.profile, translation=False)
+    scenes: list[Motion | None] = [None, DirectedMotion(np.array([[0.6, 0.0, 0.8]]))]
+    each = [PointChanges(recording.imu, known, table, scene, predict(known, table, scene)) for scene in scenes]
+    profiles = list(changed(recording.profile).values())
+    np.testing.assert_allclose(each[1].by_each(profiles), each[0].by_each(profiles), atol=1e-12)
 
 
 @pytest.mark.parametrize(("setup", "travels"), SETUPS.values(), ids=SETUPS)

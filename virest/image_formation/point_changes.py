@@ -71,8 +71,7 @@ class PointChanges:
 
     def _differs_by_motion(self, profile: CameraProfile) -> bool:
         """Whether only rates and axes differ, and no stabiliser follows them."""
-        still = self.known.lens.shift is None and (self.scene is None or isinstance(self.scene, InertialMotion))
-        return still and touched(self.known.profile, profile).only_motion
+        return self.known.lens.shift is None and touched(self.known.profile, profile).only_motion
 
     def _by_motion(self, profiles: Sequence[CameraProfile]) -> Array:
         way, gyro = self.known.trajectory, self.known.measured.gyro
