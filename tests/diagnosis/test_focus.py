@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from virest.camera.field import Field
 from virest.camera.response import ResponseCurve
 from virest.capture.folder import read_capture, resolve_profile
 from virest.capture.video import GrayReader, probe_movie
+from virest.diagnosis.field import focus
+from virest.diagnosis.field.blur import blur_finding
 from virest.diagnosis.field.focus import blur_fields, moving_focus
-from virest.diagnosis.findings import FieldFinding
+from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
 from virest.diagnosis.local_blur import look_for_blur
 from virest.motion.integration import integrate_gyro
 from virest.simulation.hidden import Hidden
@@ -38,9 +41,9 @@ def found(folder: Path, blur_px: Callable[[float], float] | None, scene: str, de
     trajectory = integrate_gyro(capture.imu, profile)
     gray = GrayReader(capture.movie, probe_movie(capture.movie))
     seen = look_for_blur(gray, capture, profile, trajectory)
-    focus = moving_focus(gray, seen, profile, trajectory, capture)
-    moving = None if focus is None else focus.finding
-    return moving, *blur_fields(seen, profile, trajectory, capture, focus)
+    by_spectra = moving_focus(gray, seen, profile, trajectory, capture)
+    moving = None if by_spectra is None else by_spectra.finding
+    return moving, *blur_fields(seen, profile, trajectory, capture, by_spectra)
 
 
 @pytest.mark.parametrize("scene", ["photographs", "leaves"])
@@ -63,8 +66,11 @@ def test_a_focus_that_hunts_is_a_blur_over_time(tmp_path: Path, scene: str) -> N
     assert np.mean(off_px < 2 * std_px) > 0.9
 
 
-def test_a_focus_that_rests_is_no_field(tmp_path: Path) -> None:
-    """Evenly soft frames do not differ, though the profile's defocus is wrong."""
+def test_a_focus_that_rests_is_no_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evenly soft frames do not differ, though the profile's defocus is wrong and widths of edges seem to change."""
+    wider = Field("blur", ("time",), ((0.0, 1.4),), ((0.0,), (2.0,)), ((0.1,), (0.1,)), 0)
+    told = blur_finding(wider, HeldOutGain(BLUR, 0.6, 0.5, None), 1e-9, ())
+    monkeypatch.setattr(focus, "blur_field", lambda _seen, profile, *_: (told, profile.with_fields([wider])))
     moving, fields, profile = found(tmp_path / "rests", lambda _t: 1.8, "photographs", defocus_px=1.0)
     assert moving is None
     assert not fields

@@ -150,6 +150,7 @@ def test_an_extension_missing_from_the_table_is_integrated_again(monkeypatch: py
     assert not touched(profile, other).rates
     monkeypatch.delitem(touched.__globals__["OF_EXTENSIONS"], "defocus_sigma_px")
     assert touched(profile, other).rates
+    assert not touched(profile, other).only_motion
 
 
 def test_the_documentation_has_the_table() -> None:

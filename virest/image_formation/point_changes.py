@@ -10,7 +10,7 @@ point moves by
 
     δp₂ = ∂p₂/∂x (θ₁ × R(t₁) r₁ + δ((c(t₁) − c(t₂)) ρ) − θ₂ × x).
 
-All profiles are integrated at once, in a tenth of the time that predictions with each of them take.
+All profiles are integrated at once.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from virest.image_formation.point_model import (
 )
 from virest.motion.integration import camera_rate
 from virest.motion.scene_motion import InertialMotion, Motion
-from virest.motion.trajectory import Turning, cross
+from virest.motion.trajectory import Turning
 
 Moved = Callable[[CameraProfile], Array]
 """Displacement (n, 2) of points for another profile."""
@@ -81,11 +81,11 @@ class PointChanges:
         turned = turning.at(poses.both_s, poses.both_exposure_s)
         before, after = turned[:count], turned[count:]
         world, whole, per_whole = self._seen_whole
-        moved = cross(before, world[..., None])
+        moved = np.cross(before, world[..., None], axis=1)
         if isinstance(self.scene, InertialMotion):
             turns = [one.rotation_cam_imu - self.known.profile.rotation_cam_imu for one in profiles]
             moved += self._by_path(turning, np.stack(turns, axis=-1), moved, self.scene)
-        moved -= cross(after, whole[..., None])
+        moved -= np.cross(after, whole[..., None], axis=1)
         return np.asarray(per_whole @ moved)
 
     @cached_property

@@ -43,11 +43,11 @@ def slopes_of(terms: Sequence[Term], at: PointChanges) -> Array:
         if term.slopes is None
         for k, quotient in enumerate(term.quotient)
     ]
-    moved, begin, found = at.by_each(changed), 0, [np.zeros((len(table), 2, 0))]
+    moved = iter(np.moveaxis(at.by_each(changed), -1, 0))
+    found = [np.zeros((len(table), 2, 0))]
     for term in terms:
-        if term.slopes is not None:
-            found.append(term.slopes(profile, table, at.by))
+        if term.slopes is None:
+            found += [(next(moved) / quotient)[..., None] for quotient in term.quotient]
         else:
-            found.append(moved[:, :, begin : begin + len(term)] / np.array(term.quotient))
-            begin += len(term)
+            found.append(term.slopes(profile, table, at.by))
     return np.concatenate(found, axis=-1)

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from virest.arrays import Array, Index
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.motion.trajectory import Trajectory, Turning, cross, hermite
+from virest.motion.trajectory import Trajectory, Turning, hermite
 
 MIN_FINITE = 0.98
 """Smallest fraction of the rows with an acceleration; gaps are interpolated."""
@@ -38,8 +38,7 @@ class Displacement:
         """
         window = np.arange(len(time_s)) if window is None else window
         arm = self._arm(time_s) - self._arm(origin_s)[window] if self.arm_cam_m.any() else 0.0
-        begun, speed = self.spline(origin_s)[window], self.spline(origin_s, 1)[window]
-        path, per_bias, per_delay = _parts(self.spline(time_s) - begun - speed * (time_s - origin_s[window])[:, None])
+        path, per_bias, per_delay = _parts(_from_rest(self.spline, time_s, origin_s, window))
         return path + arm, per_bias, per_delay
 
     def velocity(self, time_s: Array, origin_s: Array) -> tuple[Array, Array, Array]:
@@ -67,18 +66,23 @@ class Displacement:
         """
         way, shape = self.trajectory, (-1, *turning.at_knots.shape[1:])
         to_world = way.rotation_world_cam
-        pushed = cross(turning.at_knots, to_world @ force[..., None]) + to_world @ force_change
+        pushed = np.cross(turning.at_knots, to_world @ force[..., None], axis=1) + to_world @ force_change
         path = _integrated_twice(way.time_s, pushed.reshape(len(pushed), -1))
-        begun, speed = path(origin_s)[window], path(origin_s, 1)[window]
-        moved = (path(time_s) - begun - speed * (time_s - origin_s[window])[:, None]).reshape(shape)
+        moved = _from_rest(path, time_s, origin_s, window).reshape(shape)
         if self.arm_cam_m.any():
-            now, begun = (cross(turning.at(t), self._arm(t)[..., None]) for t in (time_s, origin_s))
+            now, begun = (np.cross(turning.at(t), self._arm(t)[..., None], axis=1) for t in (time_s, origin_s))
             moved += now - begun[window]
         return np.asarray(moved)
 
     def _arm(self, time_s: Array) -> Array:
         """Camera's centre relative to the IMU, world axes: −R_world_cam p_cam_imu."""
         return -np.squeeze(self.trajectory.orientation(time_s) @ self.arm_cam_m[:, None], -1)
+
+
+def _from_rest(path: CubicHermiteSpline, time_s: Array, origin_s: Array, window: Index) -> Array:
+    """A path (n, k) at times (n,), from rest at the origin (w,) of each window."""
+    begun, speed = path(origin_s)[window], path(origin_s, 1)[window]
+    return np.asarray(path(time_s) - begun - speed * (time_s - origin_s[window])[:, None])
 
 
 def _parts(values: Array) -> tuple[Array, Array, Array]:

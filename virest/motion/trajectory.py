@@ -37,8 +37,7 @@ class Trajectory:
     def rate_rad_s(self, time_s: Any) -> Array:
         """Camera-frame angular rate (..., 3) at times (...)."""
         interval, since = self._locate(np.asarray(time_s, float))
-        a, b, c, d = self.rate_polynomials.take(interval, axis=2)
-        return _vectors(((a * since + b) * since + c) * since + d)
+        return _vectors(_rate(self.rate_polynomials.take(interval, axis=2), since))
 
     def angular_acceleration_rad_s2(self, time_s: Any) -> Array:
         """Change of the camera-frame rate (..., 3) at times (...)."""
@@ -67,16 +66,14 @@ class Trajectory:
 
     def turned_by(self, rate_polynomials: Array) -> Turning:
         """To first order, the rotations due to further rates (4, 3, n − 1, k), in camera axes."""
-        step_s, start = np.diff(self.time_s), rate_polynomials[3]
-        a, b, c, d = rate_polynomials
-        h = step_s[:, None]
-        angle = h * (d + h * (c / 2 + h * (b / 3 + h * (a / 4))))
-        last = ((a[:, -1] * h[-1] + b[:, -1]) * h[-1] + c[:, -1]) * h[-1] + d[:, -1]
-        rate = np.concatenate([start, last[:, None]], axis=1)
-        rotation = self.rotation_world_cam
-        turned = np.zeros((len(self.time_s), 3, rate_polynomials.shape[-1]))
-        np.cumsum(0.5 * (rotation[:-1] + rotation[1:]) @ np.moveaxis(angle, 1, 0), axis=0, out=turned[1:])
-        return Turning(self.time_s, turned, rotation @ np.moveaxis(rate, 1, 0))
+        step_s, rotation = np.diff(self.time_s)[:, None], self.rotation_world_cam
+        angle = np.moveaxis(_integral(rate_polynomials, step_s), 1, 0)
+        last = _rate(rate_polynomials[:, :, -1], step_s[-1])
+        rate = np.moveaxis(np.concatenate([rate_polynomials[3], last[:, None]], axis=1), 1, 0)
+        at_knots = np.zeros(rate.shape)
+        np.cumsum(0.5 * (rotation[:-1] + rotation[1:]) @ angle, axis=0, out=at_knots[1:])
+        flat = (part.reshape(len(part), -1) for part in (at_knots, rotation @ rate))
+        return Turning(at_knots, hermite(self.time_s, *flat))
 
     def _locate(self, time_s: Array) -> tuple[Index, Array]:
         """Interval of each time (...), and the seconds since its knot (...). Times beyond the knots are clipped."""
@@ -89,21 +86,17 @@ class Trajectory:
 class Turning:
     """Small rotations θ of a camera about world axes, k at once: R becomes exp(θ) R."""
 
-    time_s: Array
-    """(n,) knots."""
     at_knots: Array
-    """(n, 3, k) rotation vectors."""
-    rate: Array
-    """(n, 3, k) their change per second, world axes."""
+    """(n, 3, k) rotation vectors at the trajectory's knots."""
+    spline: CubicHermiteSpline
+    """(3 k) the same at any time, flat."""
 
     def at(self, time_s: Array, exposure_s: Array | float = 0.0) -> Array:
         """θ (m, 3, k) at times (m,), or averaged over exposures around them: θ + θ'' E² / 24, to second order."""
-        held = np.clip(time_s, self.time_s[0], self.time_s[-1])
-        flat = (part.reshape(len(part), -1) for part in (self.at_knots, self.rate))
-        spline = hermite(self.time_s, *flat)
-        found = spline(held)
+        held = np.clip(time_s, self.spline.x[0], self.spline.x[-1])
+        found = self.spline(held)
         if np.any(exposure_s):
-            found = found + spline(held, 2) * (np.asarray(exposure_s) ** 2 / 24)[..., None]
+            found = found + self.spline(held, 2) * (np.asarray(exposure_s) ** 2 / 24)[..., None]
         return np.asarray(found).reshape(-1, *self.at_knots.shape[1:])
 
 
@@ -146,11 +139,6 @@ def hermite(time_s: Array, values: Array, slopes: Array) -> CubicHermiteSpline:
     return CubicHermiteSpline.construct_fast(pieces, time_s, True, 0)
 
 
-def cross(turned: Array, vectors: Array) -> Array:
-    """θ × v (n, 3, k) of rotations (n, 3, k) and vectors (n, 3, 1 or k)."""
-    return np.moveaxis(_cross(np.moveaxis(turned, 1, 0), np.moveaxis(vectors, 1, 0)), 0, 1)
-
-
 def turned(rotation: Array, rays: Array) -> Array:
     """Apply rotations (n, 3, 3) to rays (n, 3)."""
     return np.asarray(np.einsum("nij,nj->ni", rotation, rays))
@@ -162,10 +150,19 @@ def turned_angle(pieces: Array, since_s: Array) -> Array:
     The rate's integral and the second term of the Magnus series for a rate that changes linearly: Δt²/12 ω₀ × ω₁ (body
     axes).
     """
+    return np.asarray(_integral(pieces, since_s) + since_s**2 / 12.0 * _cross(pieces[3], _rate(pieces, since_s)))
+
+
+def _rate(pieces: Array, since_s: Array) -> Array:
+    """Rate (3, ...) of polynomials (4, 3, ...), highest power first, after a given time."""
     a, b, c, d = pieces
-    end_rate = ((a * since_s + b) * since_s + c) * since_s + d
-    angle = since_s * (d + since_s * (c / 2 + since_s * (b / 3 + since_s * (a / 4))))
-    return np.asarray(angle + since_s**2 / 12.0 * _cross(d, end_rate))
+    return np.asarray(((a * since_s + b) * since_s + c) * since_s + d)
+
+
+def _integral(pieces: Array, since_s: Array) -> Array:
+    """Its integral (3, ...) from the piece's start."""
+    a, b, c, d = pieces
+    return np.asarray(since_s * (d + since_s * (c / 2 + since_s * (b / 3 + since_s * (a / 4)))))
 
 
 def _cross(u: Array, v: Array) -> Array:

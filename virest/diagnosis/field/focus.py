@@ -21,6 +21,7 @@ from virest.camera.profile import CameraProfile
 from virest.capture.join import median_period_s
 from virest.capture.records import Capture
 from virest.diagnosis.field.blur import MIN_GAIN, MIN_SIZE_PX, blur_field, blur_finding
+from virest.diagnosis.field.forms import TIME
 from virest.diagnosis.field.screening import MAX_P
 from virest.diagnosis.findings import BLUR, FieldFinding, HeldOutGain
 from virest.diagnosis.local_blur import (
@@ -56,7 +57,6 @@ LEAST_TILES, LEAST_BINS, LEAST_IN_BIN = 5, 4, 3
 """Fewest tiles of a pair, bins of a tile, and tiles in which a bin of a pair is measured."""
 STEP_S, MOST_TIMES = 0.1, 100
 """Spacing of the compared frames: a focus motor takes 0.1 to 0.5 s for a move; and their largest number."""
-TIME = ("time",)
 APART = 1, 3, 9
 """Distances of compared frames, in steps: near pairs follow the motion, far ones keep errors from adding up."""
 LEAST_AS_DEFOCUS = 0.55
@@ -139,7 +139,7 @@ def blur_fields(
     """
     by_edges = blur_field(seen, profile, trajectory, capture)
     covariates = () if by_edges is None else by_edges[0].covariates
-    if by_edges is None or (covariates == TIME and by_spectra is not None):
+    if by_edges is None or (covariates == (TIME,) and by_spectra is not None):
         found, own = [], profile
     else:
         found, own = [by_edges[0]], by_edges[1]
@@ -181,7 +181,7 @@ def moving_focus(
         return None
     if not differ:
         by_edges = blur_field(seen, profile, trajectory, capture)
-        if by_edges is None or by_edges[0].covariates != TIME:
+        if by_edges is None or by_edges[0].covariates != (TIME,):
             return None
     ratios = _compared(gray, wanted, capture, profile, trajectory)
     tiles = _tiles(replace(seen, ratios=ratios), profile, trajectory)
