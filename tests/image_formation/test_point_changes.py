@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from image_formation.test_point_model import FAR, NEAR
+from image_formation.test_point_model import FAR, NEAR, over_the_ground
 from motion.synthetic_tracks import Setup, recorded
 
 from virest.camera.field import Field
@@ -63,6 +63,18 @@ def test_changes_of_rates_and_axes_move_points_as_new_predictions_do(setup: Setu
         largest = np.abs(expected).max()
         assert largest > 1e-6, name
         assert np.abs(found[:, :, k] - expected).max() < 0.005 * largest, name
+
+
+def test_points_beyond_the_horizon_turn_with_the_camera_alone() -> None:
+    """Over the ground half of the points lie above the horizon, and stay infinitely far when axes change slightly."""
+    recording = recorded(NEAR["swaying"])
+    table = recording.table()
+    known, scene = over_the_ground(recording, table)
+    changes = PointChanges(recording.imu, known, table, scene, predict(known, table, scene))
+    term = TERMS["imu_rotation"]
+    profiles = [term.change(recording.profile, 1e-5 * np.eye(3)[k]) for k in range(3)]
+    expected = np.stack([changes.by(one) for one in profiles], axis=-1)
+    np.testing.assert_allclose(changes.by_each(profiles), expected, atol=0.01 * np.abs(expected).max())
 
 
 def test_other_changes_are_predicted_anew() -> None:

@@ -6,17 +6,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from motion.synthetic_tracks import Setup, recorded
+from motion.synthetic_tracks import Recording, Setup, recorded
 from scipy.spatial.transform import Rotation
 
 from virest.camera.profile import CameraProfile
 from virest.camera.shutter import READOUT_DIRECTIONS, Shutter
-from virest.image_formation.point_model import integrate_motion, predict, pulse_delay_s, seen_s, with_profile
+from virest.image_formation.point_model import (
+    IntegratedMotion,
+    TrackTable,
+    integrate_motion,
+    predict,
+    pulse_delay_s,
+    seen_s,
+    with_profile,
+)
 from virest.image_formation.row_clock import right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import Term
 from virest.motion.integration import integrate_gyro
-from virest.motion.scene_motion import DirectedMotion
+from virest.motion.scene_motion import DirectedMotion, InertialMotion
 
 LANDSCAPE = {"width": 640, "height": 480, "centre_px": (331.0, 226.0)}
 FAR = {
@@ -87,6 +95,32 @@ def test_derivatives_of_the_motion_match_difference_quotients(setup: Setup) -> N
         quotient = (ahead.second_px - back.second_px) / (2 * step)
         planes = entry in (10, 11, 12, 16, 17, 18)
         assert np.abs(slopes[..., entry] - quotient).max() < (0.002 if planes else 0.12) * np.abs(quotient).max(), entry
+
+
+def test_points_beyond_the_horizon_are_infinitely_far_for_derivatives_too() -> None:
+    """Over the ground half of the points lie above the horizon, and no small change of the plane moves those."""
+    recording, table = recorded(NEAR["swaying"]), recorded(NEAR["swaying"]).table()
+    known, scene = over_the_ground(recording, table)
+    at = predict(known, table, scene, slopes=True)
+    assert at.slopes is not None
+    assert at.moved is not None
+    above = at.moved.inverse_depth == 0
+    assert 0.2 < above.mean() < 0.8
+    assert not at.slopes[above].any()
+    for entry in (10, 11, 12):
+        change = np.zeros(13)
+        change[entry] = 1e-5
+        ahead, back = (predict(known, table, scene.with_vector(scene.vector() + s * change)) for s in (1, -1))
+        quotient = (ahead.second_px - back.second_px) / 2e-5
+        np.testing.assert_allclose(at.slopes[..., entry], quotient, atol=0.005 * np.abs(quotient).max())
+
+
+def over_the_ground(recording: Recording, table: TrackTable) -> tuple[IntegratedMotion, InertialMotion]:
+    """A recording's motion 2 m above the ground, across which the camera looks, and the scene."""
+    known = integrate_motion(recording.imu, recording.profile, translation=True)
+    scene = recording.scene(table)
+    down = recording.in_trajectory_axes(recording.orientation(np.zeros(1)).apply([[0.0, 1.0, 0.0]]))
+    return known, replace(scene, plane_per_m=0.5 * down)
 
 
 def test_parallax_lies_along_the_direction_of_travel() -> None:

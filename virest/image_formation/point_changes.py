@@ -117,4 +117,5 @@ class PointChanges:
         where = step.paths[0].centre(scene, scene.velocity_m_s[window])
         clearance = np.maximum(1 - (plane * where).sum(axis=-1), SMALLEST_DEPTH)[:, None]
         nearer = np.einsum("ni,nik->nk", plane, moved_rays + step.inverse_depth[:, None, None] * first) / clearance
+        nearer[step.inverse_depth == 0] = 0.0  # beyond the plane's horizon
         return (first - second) * step.inverse_depth[:, None, None] + step.step[:, :, None] * nearer[:, None, :]

@@ -408,6 +408,7 @@ def _moved_inertially(
     since_1, since_2, each = paths[0].since_s, paths[1].since_s, np.eye(3)[None]
     nearer = (inverse_depth / clearance)[:, None] * plane  # change of the inverse depth per metre of the first centre
     per_plane = world / clearance[:, None] + (inverse_depth / clearance)[:, None] * centre_1
+    per_plane[inverse_depth == 0] = 0.0  # beyond the plane's horizon
     if scene.plane_axes is not None:
         per_plane = np.einsum("ni,nij->nj", per_plane, scene.plane_axes[window])
     first, second = (path.shared_slopes() for path in paths)
