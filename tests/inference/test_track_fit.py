@@ -15,8 +15,6 @@ from virest.image_formation.point_model import integrate_motion, predict
 from virest.inference import profile_terms as terms_of
 from virest.inference.clustered import CovarianceModel
 from virest.inference.coded_motion import StepSlopes, coding_bias_px, drawn_px, step_slopes
-from virest.inference.descent import Slopes
-from virest.inference.track_evidence import State, TrackEvidence
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, start_scene
 from virest.inference.tracking_bias import bias_std
 from virest.motion.scene_motion import InertialMotion
@@ -212,21 +210,6 @@ def test_points_off_the_wall_widen_the_depth_spread() -> None:
     assert 0.05 < fitted.depth_spread_per_m < 0.25
     assert flat.depth_spread_per_m < 0.03
     assert abs(errors(fitted)[0]) < 4 * deviations(fitted)[0]
-
-
-def test_the_spread_of_depths_is_held_while_the_camera_speeds_up() -> None:
-    """Residuals would else shrink with a faster path, whose parallax is longer, and the fit would run after it."""
-    recording = recorded(replace(WALL, sway_m=0.1))
-    table, scene = recording.table(), recording.scene(recording.table())
-    known = integrate_motion(recording.imu, recording.profile, translation=True)
-    evidence = TrackEvidence(recording.imu, table, (), scene)
-    held = State(known, scene, np.zeros(0), 0.1, predict(known, table, scene).along_px)
-    faster = replace(held, scene=replace(scene, velocity_m_s=scene.velocity_m_s + np.array([0.0, 0.0, 3.0])))
-    here, there = (evidence.look(state, None, Slopes.HERE).prediction for state in (held, faster))
-    np.testing.assert_array_equal(evidence.whitening(faster, there), evidence.whitening(held, here))
-    free = replace(faster, along_px=None)
-    weights = [np.linalg.det(evidence.whitening(*one)).mean() for one in ((free, there), (held, here))]
-    assert weights[0] < 0.5 * weights[1]
 
 
 def test_gyroscope_drift_does_not_shrink_with_tracking_noise() -> None:

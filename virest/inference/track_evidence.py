@@ -39,10 +39,6 @@ class State:
     """(k,) change of the terms' values from the starting profile."""
     depth_spread: float
     """Standard deviation of points' inverse depths about the plane, 1/m."""
-    along_px: Array | None = None
-    """(n, 2) change of the second points per 1/m to which the spread applies; None: that of the prediction.
-
-    Held during a descent: residuals would else shrink wherever a faster camera widens their standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,10 +166,9 @@ class TrackEvidence:
         """Matrices (n, 2, 2), 1/px, that divide by the standard deviations of the predicted points."""
         noise = self.table.noise_px[self.table.pair]
         whole = np.eye(2) / noise[:, None, None]
-        along_px = at.along_px if state.along_px is None else state.along_px
-        if along_px is None:
+        if at.along_px is None:
             return np.asarray(whole)
-        length, way = lengths_and_ways(along_px)
+        length, way = lengths_and_ways(at.along_px)
         shrink = 1 - 1 / np.sqrt(1 + (state.depth_spread * length / noise) ** 2)
         return np.asarray(whole - ((shrink / noise)[:, None] * way)[:, :, None] * way[:, None, :])
 
@@ -184,7 +179,7 @@ class TrackEvidence:
             profile = term.change(profile, step[part])
         scene = None if state.scene is None else state.scene.with_vector(state.scene.vector() + step[count:])
         known = with_profile(state.known, self.imu, profile)
-        return replace(state, known=known, scene=scene, change=state.change + step[:count])
+        return State(known, scene, state.change + step[:count], state.depth_spread)
 
     def depth_spread(self, system: TrackSystem) -> float:
         """Standard deviation of inverse depths, from the excess of residuals along the parallax over those across."""

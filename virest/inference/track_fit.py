@@ -213,7 +213,7 @@ def fit_from(
         spread, look = evidence.depth_spread(system), system.look
         if not inertial or abs(spread - state.depth_spread) <= SPREAD_TOLERANCE * spread:
             break
-        state = replace(system.state, depth_spread=spread, along_px=look.prediction.along_px)
+        state = replace(system.state, depth_spread=spread)
     inverse, bend = system.inverse(), 1.0
     if covariances and directed and inverse.size:
         system, inverse = at_profile_minimum(evidence, system)
