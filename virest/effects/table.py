@@ -146,7 +146,7 @@ _POINTS = (
         "camera and IMU clocks run at different rates",
         "the camera and IMU clocks drift apart by {clock_skew} s per second",
         Steps(
-            by.skew_clock, _difference(lambda p: p.clock_skew), (1e-5,), (0.005,), (0.05,), 0.03, ((-0.003,), (0.003,))
+            by.skew_clock, _difference(lambda p: p.clock_skew), (1e-4,), (0.005,), (0.05,), 0.03, ((-0.003,), (0.003,))
         ),
         calibrated=Calibrated(
             "clock_skew", lambda p: p.clock_skew, by.keep_value("clock_skew"), 0.0015, "clock-skew", CLOCK_SKEW_OFF
