@@ -71,6 +71,19 @@ def test_velocity_and_depth_are_recovered_within_their_deviations(name: str) -> 
     np.testing.assert_allclose([m.depth.depth_m for _, m in seen], depth, rtol=0.05)
 
 
+def test_a_level_camera_travels_over_the_ground() -> None:
+    """The optical axis ends above the horizon, so the points on the ground tell the scale; no depth is at the centre."""
+    ground = Sway(seed=6, sway_m=0.12, depth_m=-30.0, normal=(0.0, 1.0, -0.05), points=90)
+    camera, found = recorded(ground), aligned(ground)
+    assert trusted(found), found.refused
+    assert velocity_error(camera, found) < 0.08
+    seen = motions(camera, found)
+    assert np.isinf([m.depth.depth_m for _, m in seen]).any()
+    below = camera.profile.intrinsics.rays(np.array([239.5, 600.0]))  # type: ignore[union-attr]
+    nearness = [(m.depth.plane_per_m @ below, camera.plane(s) @ below) for s, m in seen]
+    np.testing.assert_allclose(*np.transpose(nearness), rtol=0.06)
+
+
 def test_the_acceleration_of_a_frame_is_its_mean() -> None:
     """Velocity and acceleration at the reference give the velocity at the frame's end, in the reference's axes."""
     camera, found = recorded(SWAYS["portrait"]), aligned(SWAYS["portrait"])

@@ -61,7 +61,7 @@ class Sway:
 
 
 RUN = 7
-PERIOD_S = 1 / 30
+PERIOD_S, FAR_M = 1 / 30, 1e5
 CENTRE_PX = np.array([233.0, 326.0])
 
 
@@ -160,6 +160,7 @@ class SwayingCamera:
     def _along(self, start: Array, way: Array) -> Array:
         """Factors by which directions (n, 3) reach the visible surface: the panel or the wall."""
         wall = (self.distance - start @ self.normal) / (way @ self.normal)
+        wall = np.where(wall > 0, wall, FAR_M)  # above the horizon
         if self.setup.panel is None:
             return wall
         panel = (self.setup.panel * self.distance - start @ self.normal) / (way @ self.normal)

@@ -30,6 +30,8 @@ QUOTIENT = 1e-3
 """Step of the difference quotient, relative to the inverse depth."""
 MAX_RELATIVE_STD = 0.5
 """Points with a larger relative standard deviation of the inverse depth are dropped."""
+LEAST_INVERSE_PER_M = 1e-6
+"""Inverse depth below which nothing is seen: a thousand kilometres."""
 MIN_POINTS = 20
 """Fewest points of a frame that shift its plane from its window's."""
 NEAR_S = 1.0
@@ -101,9 +103,9 @@ class FrameDepth:
     plane_per_m: Array
     """(3,) camera axes at the frame's time: the inverse depth of a ray r with z = 1 is plane · r."""
     depth_m: float
-    """Along the optical axis at the picture's centre."""
+    """Along the optical axis at the picture's centre; inf where the plane lies below a horizon there."""
     std_m: float
-    """Includes that of the metric scale."""
+    """Includes that of the metric scale; inf with an infinite depth."""
     points: int
     """Number of triangulated points that determine the plane; 0: the window's plane."""
     reason: str = ""
@@ -113,9 +115,9 @@ class FrameDepth:
 
     def with_relief(self, relief: Relief, middle: Array, relative_std: float) -> FrameDepth:
         """The same scene with relief on its plane; middle (3,): the ray through the picture's centre."""
-        inverse = max(float(self.plane_per_m @ middle + relief.at(middle)), 1e-6)
-        relative = float(np.hypot(relief.std_at(middle) / inverse, relative_std))
-        return replace(self, depth_m=1 / inverse, std_m=relative / inverse, relief=relief)
+        inverse = float(self.plane_per_m @ middle + relief.at(middle))
+        depth_m, std_m = _depth_m(inverse, float(relief.std_at(middle)), relative_std)
+        return replace(self, depth_m=depth_m, std_m=std_m, relief=relief)
 
 
 def triangulate(known: IntegratedMotion, scene: InertialMotion, table: TrackTable) -> TriangulatedPoints:
@@ -239,9 +241,15 @@ def frame_depth(
 
 def _concluded(found: FrameDepth, middle: Array, variance: float, relative_std: float) -> FrameDepth:
     """Depth at the picture's centre; variance: of its inverse, from the points alone."""
-    inverse = max(float(found.plane_per_m @ middle), 1e-6)
-    relative = float(np.hypot(np.sqrt(variance) / inverse, relative_std))
-    return FrameDepth(found.plane_per_m, 1 / inverse, relative / inverse, found.points, found.reason)
+    depth_m, std_m = _depth_m(float(found.plane_per_m @ middle), float(np.sqrt(variance)), relative_std)
+    return FrameDepth(found.plane_per_m, depth_m, std_m, found.points, found.reason)
+
+
+def _depth_m(inverse_per_m: float, std_per_m: float, relative_std: float) -> tuple[float, float]:
+    """Depth and its standard deviation from the inverse depth, its deviation, and that of the metric scale."""
+    if inverse_per_m <= LEAST_INVERSE_PER_M:
+        return np.inf, np.inf
+    return 1 / inverse_per_m, float(np.hypot(std_per_m / inverse_per_m, relative_std)) / inverse_per_m
 
 
 def _robust_plane(rays: Array, inverse: Array, std: Array, start: Array, prior_std: float) -> tuple[Array, Array, int]:

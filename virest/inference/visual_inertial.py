@@ -18,7 +18,7 @@ from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, with_profile
+from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, predict, with_profile
 from virest.inference.camera_travel import Stretch, VisualInertialAlignment, Window
 from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.depth import SightedPoints, triangulate, triangulate_relief
@@ -63,6 +63,8 @@ STATED_DEPTH_STD = 0.02
 """Relative standard deviation of a profile's depth."""
 TRACKING_BIAS_PX = 0.04
 """Systematic tracking error from blur and codec: a constant error of each step, hence of the velocity."""
+LEAST_NEARNESS = 0.5
+"""The optical axis represents a window's points if the plane is at most twice as far on it as it is on their mean."""
 IMU_MARGIN_S = 2.5
 """A stretch uses inertial samples up to this far beyond its tracked points."""
 
@@ -172,7 +174,9 @@ def _fit_stretch(
         fit = _at_depth(fit, imu, table, profile, terms, depth_m)
     assert isinstance(fit.scene, InertialMotion)
     points = triangulate(fit.integrated, fit.scene, table)
-    stretch = Stretch(fit, table, (), points, _velocity_floor(fit, table), _perturbed(fit, imu))
+    stretch = Stretch(
+        fit, table, (), points, _velocity_floor(fit, table), _perturbed(fit, imu), sights=_sights(fit, table)
+    )
     stretch = replace(stretch, windows=tuple(_judged(stretch, rotating, k, depth_m) for k in range(table.n_windows)))
     sights = triangulate_relief(fit.integrated, fit.scene, observed.table(observed.tracks))
     reliefs = tuple(_relief(stretch, sights, k) for k in range(table.n_windows))
@@ -190,6 +194,27 @@ def _relief(stretch: Stretch, sights: SightedPoints, window: int) -> WindowRelie
         return stretch.view(window, time_s, stretch.frame_plane(window, time_s).plane_per_m)
 
     return find_relief(sights.chosen(sights.points.window == window), grid, view)
+
+
+def _sights(fit: TrackFit, table: TrackTable) -> Array:
+    """Rays (windows, 3), z = 1, camera axes, on which nearness is judged.
+
+    The optical axis; or, where it meets the plane far behind the points or never, as that of a level camera over the
+    ground does, the mean ray of the points on the plane.
+    """
+    scene, known = fit.scene, fit.integrated
+    assert isinstance(scene, InertialMotion)
+    prediction = predict(known, table, scene)
+    assert prediction.moved is not None
+    poses, nearness = prediction.poses, prediction.moved.inverse_depth
+    rays = known.lens.rays(table.first_px, poses.first_s, poses.first_exposure_s)
+    axes = known.trajectory.orientation(np.asarray(fit.profile.imu_time_s(table.origin_s)))[:, :, 2]
+    sights = np.tile([0.0, 0.0, 1.0], (table.n_windows, 1))
+    for window, (axis, plane) in enumerate(zip(axes, scene.plane_per_m, strict=True)):
+        on_plane = (table.window == window) & (nearness > 0)
+        if on_plane.any() and plane @ axis < LEAST_NEARNESS * nearness[on_plane].mean():
+            sights[window] = rays[on_plane].mean(axis=0)
+    return sights
 
 
 def _perturbed(fit: TrackFit, imu: ImuSamples) -> tuple[IntegratedMotion, ...]:
@@ -235,8 +260,7 @@ def _judged(stretch: Stretch, rotating: TrackFit, window: int, depth_m: float | 
     velocity, covariance = stretch.seen_velocity(window, times)
     spread = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean())
     speed = max(float(np.sqrt((velocity**2).sum(axis=-1).mean())), 1e-6)
-    axis = fit.integrated.trajectory.orientation(stretch.origin_s(window))[:, 2]
-    inverse = max(float(stretch.scene.plane_per_m[window] @ axis), 1e-6)
+    inverse = stretch.nearness_per_m(window)
     scale_std = stretch.plane_std_per_m(window) / inverse
     flow, flow_covariance = stretch.flow(window, times)
     flow_std = np.sqrt(np.trace(flow_covariance, axis1=-2, axis2=-1).mean() / max((flow**2).sum(axis=-1).mean(), 1e-12))

@@ -476,9 +476,10 @@ def _translation_note(known: list[FrameMotion], alignment: VisualInertialAlignme
     std_m_s = alignment.velocity_std_m_s(np.array([m.reference_s for m in known]))
     spread = np.sqrt(np.nanmean((std_m_s**2).sum(axis=1)))
     points = int(np.median([m.depth.points for m in known]))
+    ahead = f"depth {depth:.2f} ± {std:.2f} m" if np.isfinite(depth) else "no surface"
     return (
         f"translation of {len(known)} frames from points and accelerometer: velocity {speed:.3f} ± {spread:.3f} m/s "
-        f"rms, depth {depth:.2f} ± {std:.2f} m at the centre, from about {points} points per frame"
+        f"rms, {ahead} at the centre, from about {points} points per frame"
     )
 
 
