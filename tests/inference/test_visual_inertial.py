@@ -72,7 +72,7 @@ def test_velocity_and_depth_are_recovered_within_their_deviations(name: str) -> 
 
 
 def test_a_level_camera_travels_over_the_ground() -> None:
-    """The optical axis ends above the horizon, so the points on the ground tell the scale; no depth is at the centre."""
+    """The optical axis ends above the horizon, so points on the ground tell the scale; no depth is at the centre."""
     ground = Sway(seed=6, sway_m=0.12, depth_m=-30.0, normal=(0.0, 1.0, -0.05), points=90)
     camera, found = recorded(ground), aligned(ground)
     assert trusted(found), found.refused
