@@ -71,10 +71,13 @@ def test_velocity_and_depth_are_recovered_within_their_deviations(name: str) -> 
     np.testing.assert_allclose([m.depth.depth_m for _, m in seen], depth, rtol=0.05)
 
 
+GROUND = Sway(seed=6, sway_m=0.12, depth_m=-30.0, normal=(0.0, 1.0, -0.05), points=90)
+"""A level camera 1.5 m above the ground, whose optical axis ends above the horizon."""
+
+
 def test_a_level_camera_travels_over_the_ground() -> None:
-    """The optical axis ends above the horizon, so points on the ground tell the scale; no depth is at the centre."""
-    ground = Sway(seed=6, sway_m=0.12, depth_m=-30.0, normal=(0.0, 1.0, -0.05), points=90)
-    camera, found = recorded(ground), aligned(ground)
+    """Points on the ground tell the scale; no depth is at the centre."""
+    camera, found = recorded(GROUND), aligned(GROUND)
     assert trusted(found), found.refused
     assert velocity_error(camera, found) < 0.08
     seen = motions(camera, found)
@@ -82,6 +85,15 @@ def test_a_level_camera_travels_over_the_ground() -> None:
     below = camera.profile.intrinsics.rays(np.array([239.5, 600.0]))  # type: ignore[union-attr]
     nearness = [(m.depth.plane_per_m @ below, camera.plane(s) @ below) for s, m in seen]
     np.testing.assert_allclose(*np.transpose(nearness), rtol=0.06)
+
+
+def test_a_stated_depth_is_that_of_the_points_on_the_ground() -> None:
+    """The optical axis has none: the plane stays where the points see it, and the path with it."""
+    camera, free = recorded(GROUND), aligned(GROUND).stretches[0]
+    depth_m = 1 / float(camera.plane(float(free.table.origin_s[0])) @ free.nearness_rays[0])
+    found = align(camera.observed, camera.imu, camera.profile, depth_m)
+    assert trusted(found), found.refused
+    assert velocity_error(camera, found) < 0.08
 
 
 def test_the_acceleration_of_a_frame_is_its_mean() -> None:

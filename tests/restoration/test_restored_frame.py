@@ -399,13 +399,14 @@ def test_translation_over_depth_is_corrected_without_metres() -> None:
     turning = camera((0.0, -2.0, 0.0), 0.02)
     travel = FrameTranslation(np.array([0.4, 0.1, 0.2]), np.zeros(3), np.array([0.05, 0.0, 0.6]), 1.6, "triangulated")
     logs = []
-    for known in (travel, replace(travel, depth_m=None, unit=1)):
+    for known in (travel, replace(travel, depth_m=np.inf), replace(travel, depth_m=None, unit=1)):
         motion = row_motion(turning.trajectory, turning.profile, FRAME.time_s, FRAME.exposure_s, translation=known)
         logs.append(degradation_parameters(motion, turning.trajectory))
-    metres, over_depth = logs
+    metres, over_ground, over_depth = logs
     assert metres.blur == over_depth.blur
     assert metres.shutter == over_depth.shutter
     assert (metres.depth_m, over_depth.depth_m, over_depth.depth_source) == (1.6, None, "none")
+    assert (over_ground.depth_m, over_ground.depth_source) == (None, "triangulated")
     for key in ("delta_position_m", "velocity_m_s"):
         assert getattr(metres.motion, key) is not None
         assert getattr(over_depth.motion, key) is None

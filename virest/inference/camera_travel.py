@@ -9,7 +9,7 @@ import numpy as np
 
 from virest.arrays import Array
 from virest.image_formation.point_model import IntegratedMotion, TrackTable, centre
-from virest.inference.depth import FrameDepth, TriangulatedPoints, frame_depth
+from virest.inference.depth import LEAST_INVERSE_PER_M, FrameDepth, TriangulatedPoints, frame_depth
 from virest.inference.profile_terms import GYRO_BIAS, TIME_OFFSET
 from virest.inference.relief import View, WindowRelief
 from virest.inference.track_fit import TrackFit
@@ -35,7 +35,7 @@ class Window:
     """First tracked frame's stamp, camera clock."""
     end_s: float
     scale_std: float
-    """Relative standard deviation of the metric scale: that of the plane's inverse depth on the window's sight."""
+    """Relative standard deviation of the metric scale: that of the plane's inverse depth on the window's ray."""
     velocity_std: float
     """rms standard deviation of the velocity over its rms."""
     parallax: float
@@ -65,14 +65,14 @@ class Stretch:
     table: TrackTable
     windows: tuple[Window, ...]
     points: TriangulatedPoints
+    nearness_rays: Array
+    """(windows, 3) rays, z = 1, camera axes, on which the planes' nearness is judged; in general the optical axis."""
     velocity_floor_m_s: Array
     """(windows,) velocity error from the systematic tracking error."""
     perturbed: tuple[IntegratedMotion, ...]
     """The fit's integrated motion with each value of its terms changed by its difference step."""
     reliefs: tuple[WindowRelief | None, ...] = ()
     """By window; None: the plane predicts held-out points as well as a surface does."""
-    sights: Array | None = None
-    """(windows, 3) rays, z = 1, camera axes, on which the plane's nearness is judged; None: the optical axis."""
 
     @property
     def scene(self) -> InertialMotion:
@@ -83,15 +83,6 @@ class Stretch:
     def origin_s(self, window: int) -> float:
         """Middle of a window, IMU clock."""
         return float(self.fit.profile.imu_time_s(self.table.origin_s[window]))
-
-    def sight(self, window: int) -> Array:
-        """Ray (3,), z = 1, camera axes, on which a window's nearness is judged."""
-        return np.array([0.0, 0.0, 1.0]) if self.sights is None else np.asarray(self.sights[window])
-
-    def nearness_per_m(self, window: int) -> float:
-        """Inverse depth of the plane on the window's sight, at the window's middle."""
-        way = self.fit.integrated.trajectory.orientation(self.origin_s(window)) @ self.sight(window)
-        return max(float(self.scene.plane_per_m[window] @ way), 1e-6)
 
     def velocity(self, window: int, time_s: Array) -> Array:
         """Velocity (n, 3) of the camera's centre in world axes, IMU clock (n,)."""
@@ -106,7 +97,7 @@ class Stretch:
         return velocity, covariance + scale + self.velocity_floor_m_s[window] ** 2 * np.eye(3)
 
     def flow(self, window: int, stamp_s: Array) -> tuple[Array, Array]:
-        """Velocity over depth (n, 3) on the window's sight, 1/s, camera axes at stamps (n,), and its covariance.
+        """Velocity over depth (n, 3) on the window's ray, 1/s, camera axes at stamps (n,), and its covariance.
 
         A common scale of velocity and depth cancels, even if it is unknown.
         """
@@ -117,7 +108,7 @@ class Stretch:
         return nearness[:, None] * velocity, covariance
 
     def _seen(self, window: int, stamp_s: Array) -> tuple[Array, Array, Array, Array]:
-        """Velocity (n, 3) in camera axes, inverse depth (n,) of the plane on the window's sight, and their slopes.
+        """Velocity (n, 3) in camera axes, inverse depth (n,) of the plane on the window's ray, and their slopes.
 
         Slopes (n, 3, k) and (n, k) are per unit of every fitted value, the profile's terms included: rotating the IMU
         rotates gravity with it and leaves the velocity unchanged.
@@ -137,15 +128,16 @@ class Stretch:
         assert moves is not None
         slope[..., len(quotients) : len(quotients) + 7] = back @ _velocity_slope(moves, time_s, origin)
         slope[..., own : own + 3] = back
-        nearness_slope[:, own + 3 : own + 6] = rotation @ self.sight(window)
+        nearness_slope[:, own + 3 : own + 6] = rotation @ self.nearness_rays[window]
         return velocity, nearness, slope, nearness_slope
 
     def _seen_from(self, known: IntegratedMotion, window: int, stamp_s: Array) -> tuple[Array, Array, Array]:
-        """Velocity in camera axes, inverse depth on the window's sight, and R_world_cam, (n, 3), (n,), (n, 3, 3)."""
+        """Velocity in camera axes, inverse depth on the window's ray, and R_world_cam, (n, 3), (n,), (n, 3, 3)."""
         time_s = np.asarray(known.profile.imu_time_s(stamp_s))
         rotation = known.trajectory.orientation(time_s)
         velocity = np.einsum("nji,nj->ni", rotation, self._velocity(known, window, time_s))
-        return velocity, np.maximum(rotation @ self.sight(window) @ self.scene.plane_per_m[window], 1e-6), rotation
+        nearness = rotation @ self.nearness_rays[window] @ self.scene.plane_per_m[window]
+        return velocity, np.maximum(nearness, LEAST_INVERSE_PER_M), rotation
 
     def _velocity(self, known: IntegratedMotion, window: int, time_s: Array) -> Array:
         moves, scene = known.displacement, self.scene
@@ -160,7 +152,7 @@ class Stretch:
         return np.asarray(velocity + slope @ own - arm)
 
     def plane_std_per_m(self, window: int) -> float:
-        """Standard deviation of the plane's inverse depth on the window's sight at the window's middle."""
+        """Standard deviation of the plane's inverse depth on the window's ray at the window's middle."""
         _, nearness, _, slope = self._seen(window, self.table.origin_s[[window]])
         variance = self.fit.covariance_model.propagate(slope[:, None, :])[0, 0, 0]
         return float(np.hypot(np.sqrt(variance), ACCEL_SCALE_STD * nearness[0]))

@@ -18,10 +18,17 @@ from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
-from virest.image_formation.point_model import IntegratedMotion, TrackTable, integrate_motion, predict, with_profile
+from virest.image_formation.point_model import (
+    IntegratedMotion,
+    TrackTable,
+    integrate_motion,
+    predict,
+    with_profile,
+    world_rays,
+)
 from virest.inference.camera_travel import Stretch, VisualInertialAlignment, Window
 from virest.inference.coarse_alignment import MIN_PAIRS
-from virest.inference.depth import SightedPoints, triangulate, triangulate_relief
+from virest.inference.depth import LEAST_INVERSE_PER_M, SightedPoints, triangulate, triangulate_relief
 from virest.inference.observed_tracks import WINDOW_S, ObservedTracks
 from virest.inference.profile_terms import FOCAL, NEAR_AXES, SMALL_BIAS, STATED_OFFSET, TIME_OFFSET, UNKNOWN_READOUT
 from virest.inference.relief import View, WindowRelief, find_relief, picture_grid
@@ -174,9 +181,9 @@ def _fit_stretch(
         fit = _at_depth(fit, imu, table, profile, terms, depth_m)
     assert isinstance(fit.scene, InertialMotion)
     points = triangulate(fit.integrated, fit.scene, table)
-    stretch = Stretch(
-        fit, table, (), points, _velocity_floor(fit, table), _perturbed(fit, imu), sights=_sights(fit, table)
-    )
+    rays = _nearness_rays(fit, table)
+    floor_m_s = _velocity_floor(_nearness_per_m(fit, table, rays), fit, table)
+    stretch = Stretch(fit, table, (), points, rays, floor_m_s, _perturbed(fit, imu))
     stretch = replace(stretch, windows=tuple(_judged(stretch, rotating, k, depth_m) for k in range(table.n_windows)))
     sights = triangulate_relief(fit.integrated, fit.scene, observed.table(observed.tracks))
     reliefs = tuple(_relief(stretch, sights, k) for k in range(table.n_windows))
@@ -196,8 +203,8 @@ def _relief(stretch: Stretch, sights: SightedPoints, window: int) -> WindowRelie
     return find_relief(sights.chosen(sights.points.window == window), grid, view)
 
 
-def _sights(fit: TrackFit, table: TrackTable) -> Array:
-    """Rays (windows, 3), z = 1, camera axes, on which nearness is judged.
+def _nearness_rays(fit: TrackFit, table: TrackTable) -> Array:
+    """Rays (windows, 3), z = 1, camera axes, on which the planes' nearness is judged.
 
     The optical axis; or, where it meets the plane far behind the points or never, as that of a level camera over the
     ground does, the mean ray of the points on the plane.
@@ -206,15 +213,22 @@ def _sights(fit: TrackFit, table: TrackTable) -> Array:
     assert isinstance(scene, InertialMotion)
     prediction = predict(known, table, scene)
     assert prediction.moved is not None
-    poses, nearness = prediction.poses, prediction.moved.inverse_depth
-    rays = known.lens.rays(table.first_px, poses.first_s, poses.first_exposure_s)
-    axes = known.trajectory.orientation(np.asarray(fit.profile.imu_time_s(table.origin_s)))[:, :, 2]
-    sights = np.tile([0.0, 0.0, 1.0], (table.n_windows, 1))
-    for window, (axis, plane) in enumerate(zip(axes, scene.plane_per_m, strict=True)):
-        on_plane = (table.window == window) & (nearness > 0)
-        if on_plane.any() and plane @ axis < LEAST_NEARNESS * nearness[on_plane].mean():
-            sights[window] = rays[on_plane].mean(axis=0)
-    return sights
+    ways, of_points = world_rays(known, table, prediction.poses, prediction.sights), prediction.moved.inverse_depth
+    rotation = known.trajectory.orientation(np.asarray(fit.profile.imu_time_s(table.origin_s)))
+    found = np.tile([0.0, 0.0, 1.0], (table.n_windows, 1))
+    for window, nearness in enumerate(_nearness_per_m(fit, table, found)):
+        on_plane = (table.window == window) & (of_points > 0)
+        if on_plane.any() and nearness < LEAST_NEARNESS * of_points[on_plane].mean():
+            ray = rotation[window].T @ ways[on_plane].mean(axis=0)
+            found[window] = ray / ray[2]
+    return found
+
+
+def _nearness_per_m(fit: TrackFit, table: TrackTable, rays: Array) -> Array:
+    """Inverse depths (windows,) of the planes on rays (windows, 3), z = 1, camera axes, at the windows' middles."""
+    assert isinstance(fit.scene, InertialMotion)
+    rotation = fit.integrated.trajectory.orientation(np.asarray(fit.profile.imu_time_s(table.origin_s)))
+    return np.asarray(np.einsum("wij,wj,wi->w", rotation, rays, fit.scene.plane_per_m))
 
 
 def _perturbed(fit: TrackFit, imu: ImuSamples) -> tuple[IntegratedMotion, ...]:
@@ -223,26 +237,24 @@ def _perturbed(fit: TrackFit, imu: ImuSamples) -> tuple[IntegratedMotion, ...]:
     return tuple(with_profile(fit.integrated, imu, term.change(fit.profile, step)) for term, step in steps)
 
 
-def _velocity_floor(fit: TrackFit, table: TrackTable) -> Array:
+def _velocity_floor(nearness_per_m: Array, fit: TrackFit, table: TrackTable) -> Array:
     """Velocity error from a constant error of TRACKING_BIAS_PX per step, at each window's depth."""
-    assert isinstance(fit.scene, InertialMotion)
     assert fit.profile.intrinsics is not None
     step_s = float(np.median(table.second_stamp_s - table.first_stamp_s))
-    depth_m = 1 / np.maximum(np.linalg.norm(fit.scene.plane_per_m, axis=-1), 1e-3)
+    depth_m = 1 / np.maximum(nearness_per_m, 1e-3)
     return np.asarray(TRACKING_BIAS_PX / fit.profile.intrinsics.fx_px * depth_m / max(step_s, 1e-3))
 
 
 def _at_depth(
     fit: TrackFit, imu: ImuSamples, table: TrackTable, profile: CameraProfile, terms: tuple[Term, ...], depth_m: float
 ) -> TrackFit:
-    """Fit again with each window's plane at the stated depth along the optical axis, with the fitted tilt."""
+    """Fit again with each window's plane at the stated depth on its ray, with the fitted tilt."""
     scene = fit.scene
     assert isinstance(scene, InertialMotion)
-    origin = np.asarray(profile.imu_time_s(table.origin_s))
-    axis = fit.integrated.trajectory.orientation(origin)[:, :, 2]
-    ratio = (1 / depth_m) / np.maximum((scene.plane_per_m * axis).sum(axis=-1), 0.02)[:, None]
+    nearness = _nearness_per_m(fit, table, _nearness_rays(fit, table))
+    ratio = (1 / depth_m) / np.maximum(nearness, 0.02)[:, None]
     plane = scene.plane_per_m * ratio
-    spread = STATED_DEPTH_STD * float(np.linalg.norm(plane, axis=-1).mean())
+    spread = STATED_DEPTH_STD / depth_m
     held = replace(
         scene, velocity_m_s=scene.velocity_m_s / ratio, plane_per_m=plane, plane_std_per_m=(spread, spread, spread)
     )
@@ -260,7 +272,7 @@ def _judged(stretch: Stretch, rotating: TrackFit, window: int, depth_m: float | 
     velocity, covariance = stretch.seen_velocity(window, times)
     spread = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean())
     speed = max(float(np.sqrt((velocity**2).sum(axis=-1).mean())), 1e-6)
-    inverse = stretch.nearness_per_m(window)
+    inverse = max(float(_nearness_per_m(fit, table, stretch.nearness_rays)[window]), LEAST_INVERSE_PER_M)
     scale_std = stretch.plane_std_per_m(window) / inverse
     flow, flow_covariance = stretch.flow(window, times)
     flow_std = np.sqrt(np.trace(flow_covariance, axis1=-2, axis2=-1).mean() / max((flow**2).sum(axis=-1).mean(), 1e-12))

@@ -192,10 +192,11 @@ def _numbers(vector: Array) -> Numbers:
 
 
 def _depth(motion: RowMotion) -> tuple[float | None, str]:
-    """Depth at the picture's centre and its source; None and ``none`` if unknown or infinite."""
-    if motion.translation is None or motion.translation.depth_m is None or np.isinf(motion.translation.depth_m):
+    """Depth at the picture's centre, None if infinite, and its source; None and ``none`` if unknown."""
+    if motion.translation is None or motion.translation.depth_m is None:
         return None, "none"
-    return motion.translation.depth_m, motion.translation.source
+    depth_m = motion.translation.depth_m
+    return None if np.isinf(depth_m) else depth_m, motion.translation.source
 
 
 def _in_metres(motion: RowMotion) -> bool:
