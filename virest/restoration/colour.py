@@ -29,8 +29,9 @@ from virest.restoration.tile_layout import (
     border_noise_to_signal,
     in_tiles,
     join_neighbours,
-    noise_to_signal,
+    measured_noise_to_signal,
     tile_deconvolution,
+    uneven_noise_to_signal,
 )
 
 COLOUR_SCALE, COARSE_COLOUR_SCALE = 2, 4
@@ -105,8 +106,9 @@ def _sharp_differences(
     recorded: from :func:`_small_differences`.
 
     Blur is linear, so the part of a difference that is proportional to the luma nearby is so in the sharp picture too,
-    if the slope is constant over a path; the luma is restored with a better prior.  The rest is restored by the
-    measured Wiener filter.
+    if the slope is constant over a path; the luma is restored with a better prior.  Proportional is the luma's
+    deviation from its local mean: slopes scatter where the luma is plain, and times the luma itself they would put that
+    scatter into the rest.  The rest is restored by the measured Wiener filter.
     """
     deconvolution = tile_deconvolution(blurred, COLOUR_TILE_PX, COARSE_OVERLAP, scale)
     luma, differences = recorded
@@ -117,11 +119,14 @@ def _sharp_differences(
         cv2.blur(slope, (side, side))
         for slope in _regression_slopes(luma, differences, cv2.multiply(noise, noise), side)
     ]
-    ratio = noise_to_signal(deconvolution, settings, blurred.chroma, scale)
+    nearby = cv2.blur(luma, (side, side))
+    ratio = measured_noise_to_signal(deconvolution, settings, blurred.chroma, scale)
+    uneven = uneven_noise_to_signal(blurred.chroma)
     factors = _noise_to_signal_factors(deconvolution.grid, differences, steepness, blurred.chroma, scale)
 
     def left_over(luma: Image, differences: list[Image]) -> list[Image]:
-        return [cv2.subtract(d, cv2.multiply(s, luma)) for d, s in zip(differences, slopes, strict=True)]
+        detail = cv2.subtract(luma, nearby)
+        return [cv2.subtract(d, cv2.multiply(s, detail)) for d, s in zip(differences, slopes, strict=True)]
 
     own = left_over(luma, differences)
     join_neighbours(
@@ -133,11 +138,13 @@ def _sharp_differences(
         scale,
         factors,
     )
+    sharp_detail = cv2.subtract(sharp, nearby)
     for number, (left, slope) in enumerate(zip(own, slopes, strict=True)):
         projected = deconvolution.back_projected(left, number)
-        least = border_noise_to_signal(deconvolution, left, blurred.longest_px / scale)
+        at_border = border_noise_to_signal(deconvolution, left, blurred.longest_px / scale)
+        least = [max(lowest, uneven) for lowest in at_border]
         filtered = deconvolution.blend(deconvolution.solutions(projected, in_tiles(ratio, least, factors)))
-        yield cv2.add(filtered, cv2.multiply(slope, sharp))
+        yield cv2.add(filtered, cv2.multiply(slope, sharp_detail))
 
 
 def _noise_to_signal_factors(

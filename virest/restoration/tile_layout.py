@@ -135,14 +135,28 @@ def noise_to_signal(
     statistics: PictureStatistics,
     scale: float = 1.0,
 ) -> Image:
-    """Measured N / S on a tile's packed spectrum."""
-    ratio = on_spectrum(statistics, settings.strength**2 * statistics.noise_to_signal, deconvolution.size, scale)
+    """Measured N / S on a tile's packed spectrum, at least :func:`uneven_noise_to_signal`."""
+    ratio = measured_noise_to_signal(deconvolution, settings, statistics, scale)
     if statistics.unevenness:
-        least = np.float32(UNEVEN_NOISE_TO_SIGNAL * statistics.unevenness)
         mean = ratio[0, 0]
-        ratio = np.maximum(ratio, least)
+        ratio = np.maximum(ratio, np.float32(uneven_noise_to_signal(statistics)))
         ratio[0, 0] = mean
     return ratio
+
+
+def measured_noise_to_signal(
+    deconvolution: tiles.TileDeconvolution,
+    settings: RestorationSettings,
+    statistics: PictureStatistics,
+    scale: float = 1.0,
+) -> Image:
+    """Measured N / S on a tile's packed spectrum."""
+    return on_spectrum(statistics, settings.strength**2 * statistics.noise_to_signal, deconvolution.size, scale)
+
+
+def uneven_noise_to_signal(statistics: PictureStatistics) -> float:
+    """Least N / S of a picture whose power lies at few frequencies."""
+    return UNEVEN_NOISE_TO_SIGNAL * statistics.unevenness
 
 
 def border_noise_to_signal(deconvolution: tiles.TileDeconvolution, light: Image, reach_px: float) -> list[float]:
