@@ -296,6 +296,29 @@ def test_non_square_pixels_are_named(aspect: float, like_them: None) -> None:
     assert_holds(found[0].parameters["pixel_aspect"], 1.0, aspect)
 
 
+def test_a_wide_lens_needs_both_coefficients() -> None:
+    """A strong barrel distortion, where k1 alone leaves a residual: both are named, with their own sizes."""
+    setup = replace(HAND, seed=89, k1=-0.2, k2=0.07)
+    truth = recorded(setup).profile
+    assert truth.intrinsics is not None
+    verdict, found = climbed(setup, replace(truth, intrinsics=replace(truth.intrinsics, model="none", coefficients=())))
+    assert [finding.name for finding in found] == ["radial_distortion", "higher_distortion"]
+    assert verdict.final_rms_px == pytest.approx(HAND.noise_px, rel=0.1)
+    assert_holds(found[0].parameters["k1"], 0.0, -0.2)
+    assert_holds(found[1].parameters["k2"], 0.0, 0.07)
+
+
+def test_a_stated_distortion_may_lack_its_second_coefficient() -> None:
+    """With the right k1 in the profile, k2 alone is named."""
+    setup = replace(HAND, seed=90, k1=-0.2, k2=0.07)
+    truth = recorded(setup).profile
+    assert truth.intrinsics is not None
+    stated = replace(truth.intrinsics, coefficients=(-0.2, 0.0, 0.0, 0.0, 0.0))
+    _, found = climbed(setup, replace(truth, intrinsics=stated))
+    assert [finding.name for finding in found] == ["higher_distortion"]
+    assert_holds(found[0].parameters["k2"], 0.0, 0.07)
+
+
 def test_non_square_pixels_are_found_with_rotation_about_one_axis(like_them: None) -> None:
     """Vertical motion determines fy but hardly fx: the aspect is named, or listed as the focal length's rival."""
     setup = replace(HAND, seed=88, about=(0.0, 0.0, 1.0), pixel_aspect=1.04)

@@ -174,8 +174,8 @@ def test_the_simulator_has_exactly_the_effects_of_the_table() -> None:
 def test_every_sentence_can_be_filled_and_every_unit_is_known() -> None:
     """A parameter's suffix is a unit, unless it is a ratio or a word."""
     plain = {"clock_skew", "readout_direction", "timestamp", "exposure_scale", "gyro_scale", "focal_scale", "k1",
-             "pixel_aspect", "axis_scale", "fraction", "frames", "gamma", "black_level", "corner_loss", "amplitude",
-             "gain", "amount"}  # fmt: skip
+             "k2", "pixel_aspect", "axis_scale", "fraction", "frames", "gamma", "black_level", "corner_loss",
+             "amplitude", "gain", "amount"}  # fmt: skip
     for effect in EFFECTS.values():
         assert effect.sentence.format(**{parameter.name: 1.0 for parameter in effect.parameters})
         assert effect.in_words

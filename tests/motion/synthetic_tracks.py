@@ -56,6 +56,7 @@ class Setup:
     """fy over fx."""
     centre_px: tuple[float, float] = (233.0, 326.0)
     k1: float = 0.0
+    k2: float = 0.0
     focal_drift_per_s: float = 0.0
     stabilised: tuple[float, float] = (0.0, 1.0)
     """Fraction and cutoff in Hz of the lens's stabiliser."""
@@ -194,8 +195,8 @@ class Recording:
         s = self.setup
         focal_px = s.focal_px, s.focal_px * s.pixel_aspect
         lens = Intrinsics(s.width, s.height, *focal_px, *s.centre_px)
-        if s.k1:
-            lens = Intrinsics(s.width, s.height, *focal_px, *s.centre_px, "radtan", (s.k1, 0.0, 0.0, 0.0, 0.0))
+        if s.k1 or s.k2:
+            lens = Intrinsics(s.width, s.height, *focal_px, *s.centre_px, "radtan", (s.k1, s.k2, 0.0, 0.0, 0.0))
         return CameraProfile(
             s.width,
             s.height,
@@ -320,7 +321,8 @@ class Recording:
         plane = local[:, :2] / local[:, 2:]
         if s.stabilised[0]:
             plane = plane + np.stack([np.interp(time_s, self._shift[0], way) for way in self._shift[1].T], axis=-1)
-        bent = plane * (1 + s.k1 * (plane**2).sum(axis=1, keepdims=True))
+        squared = (plane**2).sum(axis=1, keepdims=True)
+        bent = plane * (1 + s.k1 * squared + s.k2 * squared**2)
         focal_px = s.focal_px * (1 + s.focal_drift_per_s * time_s[:, None])
         return bent * focal_px * (1.0, s.pixel_aspect) + s.centre_px
 

@@ -33,6 +33,7 @@ CHANGES = {
     "pixel_aspect": "intrinsics.fy_px",
     "focal_drift": "extensions.focal_drift",
     "radial_distortion": "intrinsics.distortion",
+    "higher_distortion": "intrinsics.distortion",
     "principal_point": "intrinsics.cx_px intrinsics.cy_px",
     "stabilisation": "extensions.stabilisation",
     "scene_depth": "scene.depth_m",

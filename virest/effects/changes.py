@@ -155,6 +155,20 @@ def add_k1(profile: CameraProfile, v: Array) -> CameraProfile:
     return replace(profile, intrinsics=replace(lens, coefficients=coefficients))
 
 
+def k2_of(profile: CameraProfile) -> float:
+    """Second radial coefficient; 0 without distortion."""
+    lens = profile.intrinsics
+    return 0.0 if lens is None or not lens.coefficients else lens.coefficients[1]
+
+
+def add_k2(profile: CameraProfile, v: Array) -> CameraProfile:
+    """Add v[0] to k2."""
+    profile = add_k1(profile, np.zeros(1))
+    lens = lens_of(profile)
+    first, second, *others = lens.coefficients
+    return replace(profile, intrinsics=replace(lens, coefficients=(first, second + float(v[0]), *others)))
+
+
 def shift_principal_point(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v px to the principal point."""
     lens = lens_of(profile)

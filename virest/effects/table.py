@@ -352,6 +352,16 @@ _POINTS = (
         calibrated=Calibrated("k1", by.k1_of, by.keep_lens("model", "coefficients"), 0.03, "distortion", 0.3),
     ),
     Effect(
+        "higher_distortion",
+        GEOMETRY,
+        _value("k2", by.k2_of),
+        "intrinsics.distortion",
+        "a wide lens bends straight lines less, or more, towards the corners than k1 alone does",
+        "beyond k1, the lens has a radial distortion of k2 = {k2}",
+        Steps(by.add_k2, _difference(by.k2_of), (1e-3,), (0.1,), (0.5,), 0.8),
+        beside="radial_distortion",
+    ),
+    Effect(
         "principal_point",
         GEOMETRY,
         (Parameter("offset_px", lambda p, given: by.principal_shift(given, p).tolist(), _each),),

@@ -23,7 +23,8 @@ PLAIN_READOUT = TERMS["readout_time"]
 READOUT = replace(PLAIN_READOUT, change=add_readout)
 """Readout change that keeps the middle row's time, so that offset and readout are fitted independently."""
 IMU_ROTATION, GYRO_BIAS, GYRO_SCALE = TERMS["imu_rotation"], TERMS["gyro_bias"], TERMS["gyro_scale"]
-FOCAL, K1, PRINCIPAL_POINT = TERMS["focal_length"], TERMS["radial_distortion"], TERMS["principal_point"]
+FOCAL, PRINCIPAL_POINT = TERMS["focal_length"], TERMS["principal_point"]
+K1, K2 = TERMS["radial_distortion"], TERMS["higher_distortion"]
 FOCAL_DRIFT, STABILISATION = TERMS["focal_drift"], TERMS["stabilisation"]
 EXPOSURE_SCALE = TERMS["exposure_time"]
 

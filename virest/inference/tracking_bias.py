@@ -43,6 +43,7 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
     "pixel_aspect": (8e-4,),
     "focal_drift": (3e-4,),
     "radial_distortion": (7e-4,),
+    "higher_distortion": (2e-3,),
     "principal_point": (0.2, 0.2),
     "stabilisation": (0.002, 0.02, 0.0, 0.0),
     "clock_skew": (1e-5,),
@@ -51,8 +52,9 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
 }
 """Bias at the typical noise, in the units of the terms of profile_terms; relative for a depth.  By analogy, not
 measured: the low-pass filter's delay as a time offset, pixel_aspect as √2 of a focal length, since only one of two
-directions determines it; the scales of axes as the gyroscope's, their misalignment as a rotation of the IMU, and the
-square of the averaging time as that scale at 3 Hz (½ (2π f σ)²)."""
+directions determines it; k2 as the k1 that bends as much at 0.6 focal lengths from the centre; the scales of axes as
+the gyroscope's, their misalignment as a rotation of the IMU, and the square of the averaging time as that scale at 3 Hz
+(½ (2π f σ)²)."""
 DRIFT_STD = {"gyro_bias": 1.5e-4}
 """Changes of a value itself, however well points are tracked: a phone's gyroscope drifts by this much within seconds,
 and the mean of its noise of 3e-4 rad/s/√Hz over 2 s is about as large."""

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from virest.arrays import Array
+from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
-from virest.effects.changes import k1_of, mean_gyro_scale
+from virest.effects.changes import k1_of, k2_of, mean_gyro_scale
 from virest.effects.table import GYRO_SCALE_OFF
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
@@ -27,6 +28,10 @@ GYRO_REACH, GYRO_STEPS = 0.14, 8
 """Gyroscope scales tried: the range of the logarithm, that of plausible errors, and their number."""
 K1_REACH, K1_STEPS = 0.3, 7
 """Radial distortions tried: the range of the first coefficient, that of wide phone lenses, and their number."""
+K2_REACH, K2_STEPS = 0.1, 3
+"""The same for the second coefficient, beside the first.  A lens with angles in proportion to radii has 1.8 k₁²."""
+LENS_RADII = 9
+"""Radii from the centre to the corners at which a lens is checked."""
 MOST_STABILISED = 0.95
 """No lens cancels more of the shake than this: such frames were cropped and rotated by software."""
 HIGHEST_CUTOFF_HZ = 15.0
@@ -114,19 +119,31 @@ def _distortions(_: TrackTable) -> Array:
     return np.linspace(-K1_REACH, K1_REACH, K1_STEPS)[:, None]
 
 
-def _with_distortion(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+def _higher_distortions(_: TrackTable) -> Array:
+    return np.linspace(-K2_REACH, K2_REACH, K2_STEPS)[:, None]
+
+
+def _with_bent_lens(profile: CameraProfile, found: CameraProfile) -> Intrinsics:
     assert profile.intrinsics is not None
     assert found.intrinsics is not None
-    lens = replace(profile.intrinsics, model=found.intrinsics.model, coefficients=found.intrinsics.coefficients)
-    return profile.with_estimate("k1", k1_of(found), float(std[0]), SOURCE, intrinsics=lens)
+    return replace(profile.intrinsics, model=found.intrinsics.model, coefficients=found.intrinsics.coefficients)
+
+
+def _with_distortion(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+    return profile.with_estimate("k1", k1_of(found), float(std[0]), SOURCE, intrinsics=_with_bent_lens(profile, found))
+
+
+def _with_higher_distortion(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+    return profile.with_estimate("k2", k2_of(found), float(std[0]), SOURCE, intrinsics=_with_bent_lens(profile, found))
 
 
 def _is_lens(_: CameraProfile, found: CameraProfile) -> bool:
-    """Whether radii grow up to the corners: r (1 + k₁ r²) does while 1 + 3 k₁ r² is positive."""
+    """Whether radii grow up to the corners: r (1 + k₁ r² + k₂ r⁴) does while 1 + 3 k₁ r² + 5 k₂ r⁴ is positive."""
     lens = found.intrinsics
     assert lens is not None
     corner = np.array([lens.width / lens.fx_px, lens.height / lens.fy_px]) / 2
-    return abs(k1_of(found)) < 2 * K1_REACH and 1 + 3 * k1_of(found) * float(corner @ corner) > 0
+    r2, k1, k2 = np.linspace(0.0, float(corner @ corner), LENS_RADII), k1_of(found), k2_of(found)
+    return abs(k1) < 2 * K1_REACH and abs(k2) < 4 * K2_REACH and float(np.min(1 + r2 * (3 * k1 + r2 * 5 * k2))) > 0
 
 
 def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
@@ -184,6 +201,18 @@ CAUSES = (
         lambda given, found, std: (
             f"radial distortion of k1 = {k1_of(found):+.4f} ± {std[0]:.4f} used "
             f"instead of the profile's {k1_of(given):+g}"
+        ),
+    ),
+    Cause(
+        "higher distortion",
+        terms_of.K2,
+        _higher_distortions,
+        _is_lens,
+        lambda given, found: k2_of(found) - k2_of(given),
+        _with_higher_distortion,
+        lambda given, found, std: (
+            f"radial distortion of k2 = {k2_of(found):+.4f} ± {std[0]:.4f} used beside k1 "
+            f"instead of the profile's {k2_of(given):+g}"
         ),
     ),
     Cause(

@@ -16,13 +16,22 @@ import numpy as np
 from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
+from virest.effects.changes import k1_of
 from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.image_formation.row_clock import as_global_shutter, right_way_round
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.coarse_alignment import MIN_PAIRS
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.observed_tracks import ObservedTracks
-from virest.inference.profile_terms import CLOCK_SKEW, K1, STATED_READOUT, UNKNOWN_READOUT, careful_terms, shift_offset
+from virest.inference.profile_terms import (
+    CLOCK_SKEW,
+    K1,
+    K2,
+    STATED_READOUT,
+    UNKNOWN_READOUT,
+    careful_terms,
+    shift_offset,
+)
 from virest.inference.robust import RAYLEIGH_MEDIAN
 from virest.inference.time_blocks import even_blocks, halves
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
@@ -51,7 +60,7 @@ outside, as phones film, and 6 real) none differs by more than 3.7 deviations.""
 TOLD_SIGMA = 3.0
 """A cause is distinguished from its twin if, fitted beside it, it remains above this many standard deviations."""
 MAX_CAUSES = 3
-"""Of the five causes, two of which are twins.  Their rounds have 5 + 4 + 3 trials."""
+"""Of the five causes, two of which are twins, and k₂ beside k₁.  Their rounds have 5 + 4 + 3 trials."""
 JUDGED = 2
 """Number of causes with plausible values tested on held-out blocks in each round, those that fit best."""
 MOST_BENT = 0.2
@@ -276,8 +285,10 @@ class _Search:
         """The cause with a plausible value that predicts held-out blocks best, if significantly better than none."""
         fitted = {term.name for term in (*self.nuisances, *(cause.term for cause in here.causes))}
         left = fit.scale * float(np.median(self.table.noise_px)) / _motion_px(self.table)
+        bent = K1.name in fitted or k1_of(here.profile) != 0
+        possible = {K1.name: left < MOST_BENT, K2.name: left < MOST_BENT and bent}
         open_causes = [
-            cause for cause in CAUSES if cause.term.name not in fitted and (cause.term is not K1 or left < MOST_BENT)
+            cause for cause in CAUSES if cause.term.name not in fitted and possible.get(cause.term.name, True)
         ]
         tried = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
         better = [one for one in tried if one[1].cost < fit.cost and one[1].scale < fit.scale and self._has_value(*one)]

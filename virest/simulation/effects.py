@@ -173,13 +173,13 @@ def _shift_principal_point(profile: CameraProfile, values: list[float]) -> Camer
     return _lens(profile, cx_px=lens.cx_px + values[0], cy_px=lens.cy_px + values[1])
 
 
-def _bend_radially(profile: CameraProfile, values: list[float]) -> CameraProfile:
-    """Set ``k1``; the other distortion coefficients are unchanged."""
+def _bend_radially(profile: CameraProfile, coefficient: int, value: float) -> CameraProfile:
+    """Set ``k1`` (0) or ``k2`` (1); the other distortion coefficients are unchanged."""
     lens = _lens(profile).intrinsics
     assert lens is not None
-    if lens.model == "none":
-        return _lens(profile, model="radtan", coefficients=(values[0], 0.0, 0.0, 0.0, 0.0))
-    return _lens(profile, coefficients=(values[0], *lens.coefficients[1:]))
+    coefficients = [0.0] * 5 if lens.model == "none" else list(lens.coefficients)
+    coefficients[coefficient] = value
+    return _lens(profile, model="radtan" if lens.model == "none" else lens.model, coefficients=tuple(coefficients))
 
 
 def _draw_axes(_: CameraProfile, context: EffectContext) -> list[float]:
@@ -269,7 +269,8 @@ _BY_NAME: dict[str, Effect] = {
         lambda p, c: [_signed(c, 0.01, 0.03)],
         lambda p, v: p.with_extensions(focal_drift_per_s=v[0]),
     ),
-    "radial_distortion": Effect(lambda p, c: [_signed(c, 0.04, 0.1)], _bend_radially),
+    "radial_distortion": Effect(lambda p, c: [_signed(c, 0.04, 0.1)], lambda p, v: _bend_radially(p, 0, v[0])),
+    "higher_distortion": Effect(lambda p, c: [_signed(c, 0.04, 0.1)], lambda p, v: _bend_radially(p, 1, v[0])),
     "principal_point": Effect(
         lambda p, c: [_signed(c, 0.01 * max(p.width, p.height), 0.03 * max(p.width, p.height)) for _ in range(2)],
         _shift_principal_point,

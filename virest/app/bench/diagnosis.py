@@ -31,7 +31,8 @@ Case = tuple[str, int]
 def diagnosis_section(work: Path, scale: Scale) -> tuple[dict[str, Any], str]:
     """Diagnose one capture per effect and seed, and a quarter as many captures without effects."""
     seeds = SEEDS["quick" if scale.quick else "full" if scale.full else "normal"]
-    cases: list[Case] = [(name, 100 * k + i) for k in range(seeds) for i, name in enumerate(EFFECTS)]
+    alone = [effect.name for effect in EFFECTS.values() if not effect.beside]
+    cases: list[Case] = [(name, 100 * k + i) for k in range(seeds) for i, name in enumerate(alone)]
     cases += [("", 9000 + k) for k in range(max(len(cases) // 4, 2))]
     rows = []
     for case in cases:
