@@ -21,7 +21,7 @@ def held(name: str, change: Any, std: Any) -> dict[str, HeldValue]:
 def test_every_optional_parameter_has_a_plausibility_bound() -> None:
     """A huge change is implausible for each of them; those of the lens are listed first."""
     assert all(not HeldValue(name, np.array([1e9]), np.ones(1)).believable for name in OPTIONAL)
-    assert list(OPTIONAL)[:3] == ["focal", "distortion", "principal-point"]
+    assert list(OPTIONAL)[:4] == ["focal", "distortion", "higher-distortion", "principal-point"]
 
 
 def test_an_undetermined_parameter_is_reset() -> None:
@@ -42,6 +42,18 @@ def test_an_undetermined_parameter_is_reset() -> None:
     assert held.r_cam_imu == start.r_cam_imu
     assert (held.gyro_scale, held.clock_skew) == (given.gyro_scale, given.clock_skew)
     assert held.intrinsics == replace(lens, cx_px=330.0)
+
+
+def test_reset_coefficients_leave_a_plain_lens_plain() -> None:
+    """Each undetermined coefficient is reset alone; where both are, the lens has no distortion again."""
+    given = CameraProfile(640, 480, intrinsics=Intrinsics(640, 480, 500.0, 500.0, 319, 239))
+    assert given.intrinsics is not None
+    bent = replace(given.intrinsics, model="radtan", coefficients=(-0.1, 0.02, 0.0, 0.0, 0.0))
+    fit = SimpleNamespace(profile=replace(given, intrinsics=bent))
+    for k1, k2 in ((True, False), (False, True), (False, False)):
+        found = reset_undetermined(fit, given, given, {"radial_distortion": k1, "higher_distortion": k2})  # type: ignore[arg-type]
+        left = (-0.1 * k1, 0.02 * k2, 0.0, 0.0, 0.0)
+        assert found.intrinsics == (replace(bent, coefficients=left) if any(left) else given.intrinsics)
 
 
 def test_a_significant_but_small_change_is_not_noted() -> None:

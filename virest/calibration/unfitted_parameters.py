@@ -72,13 +72,15 @@ def held_values(
     """Fit once more with all optional terms free: the values that ``fit`` held fixed, by key of OPTIONAL.
 
     noise_px: tracking noise.  exposures_vary: if not, an exposure scale is indistinguishable from a time offset and is
-    left out.
+    left out.  A value that refines another is free only if ``fit`` fitted that one.
     """
     fitted = {term.name for term in fit.terms}
     wanted = {
         name: term
         for name, term in OPTIONAL.items()
-        if term.name not in fitted and (exposures_vary or name != "exposure-scale")
+        if term.name not in fitted
+        and (exposures_vary or name != "exposure-scale")
+        and EFFECTS[term.name].beside in {"", *fitted}
     }
     free = fit_tracks(imu, table, fit.profile, [*fit.terms, *wanted.values()], fit.scene)
     return {

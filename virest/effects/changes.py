@@ -169,6 +169,23 @@ def add_k2(profile: CameraProfile, v: Array) -> CameraProfile:
     return replace(profile, intrinsics=replace(lens, coefficients=(first, second + float(v[0]), *others)))
 
 
+def keep_k1(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+    """The profile with k1 of the given lens; a lens without distortion stays one."""
+    return _plain_again(add_k1(profile, np.array([k1_of(given) - k1_of(profile)])), given)
+
+
+def keep_k2(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+    """The same with k2."""
+    return _plain_again(add_k2(profile, np.array([k2_of(given) - k2_of(profile)])), given)
+
+
+def _plain_again(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+    lens, before = lens_of(profile), given.intrinsics
+    if before is None or before.model != "none" or any(lens.coefficients):
+        return profile
+    return replace(profile, intrinsics=replace(lens, model="none", coefficients=before.coefficients))
+
+
 def shift_principal_point(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v px to the principal point."""
     lens = lens_of(profile)

@@ -349,7 +349,7 @@ _POINTS = (
         "the lens bends straight lines",
         "the lens has a radial distortion of k1 = {k1}",
         Steps(by.add_k1, _difference(by.k1_of), (1e-3,), (0.1,), (0.5,), 0.8),
-        calibrated=Calibrated("k1", by.k1_of, by.keep_lens("model", "coefficients"), 0.03, "distortion", 0.3),
+        calibrated=Calibrated("k1", by.k1_of, by.keep_k1, 0.03, "distortion", 0.3),
     ),
     Effect(
         "higher_distortion",
@@ -359,6 +359,7 @@ _POINTS = (
         "a wide lens bends straight lines less, or more, towards the corners than k1 alone does",
         "beyond k1, the lens has a radial distortion of k2 = {k2}",
         Steps(by.add_k2, _difference(by.k2_of), (1e-3,), (0.1,), (0.5,), 0.8),
+        calibrated=Calibrated("k2", by.k2_of, by.keep_k2, 0.03, "higher-distortion", 0.3),
         beside="radial_distortion",
     ),
     Effect(

@@ -14,6 +14,7 @@ from virest.app.machine import cores, prepare_process
 CALIBRATED_EXTRAS = (
     "focal",
     "distortion",
+    "higher-distortion",
     "principal-point",
     "gyro-scale",
     "clock-skew",
