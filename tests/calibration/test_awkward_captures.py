@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnosis.strange_phone import Strange, StrangePhone
+from motion.synthetic_tracks import Setup
 
 from virest.app.calibrate import find_calibration, plan_calibration
 from virest.app.simulate import simulate_command
@@ -170,3 +172,21 @@ def test_a_drift_seen_in_few_time_blocks_needs_more_deviations(blocks: float, si
     fit = SimpleNamespace(stretches=np.array([blocks]), slices={"clock_skew": slice(0, 1)})
     found: Any = SimpleNamespace(fit=fit, values=(skew,), profile=SimpleNamespace(clock_skew=0.0035))
     assert _is_significant(found, 0.0) == significant
+
+
+def test_a_wide_lens_is_found_while_the_camera_sways_before_a_wall() -> None:
+    """Translation alone cannot replace the lens: a fit of it would end at a wrong offset and stay there."""
+    setup = Setup(
+        seed=5, frames=61, points=40, width=640, height=480, focal_px=440.0, centre_px=(319.5, 239.5), k1=-0.22,
+        k2=0.07, plane_per_m=(0.0, 0.0, 0.33), sway_m=0.03, rate_rad_s=0.9, readout_direction="top_to_bottom",
+        exposure_swing=0.0, noise_px=0.06,
+    )  # fmt: skip
+    phone = StrangePhone(setup, Strange())
+    lens = phone.profile.intrinsics
+    assert lens is not None
+    plain = replace(phone.profile, intrinsics=replace(lens, model="none", coefficients=()), depth_m=None)
+    found = calibrate_geometry(phone.capture, plain, phone.pairs, ("distortion", "higher-distortion"))
+    assert found.profile.intrinsics is not None
+    assert found.profile.intrinsics.coefficients[:2] == pytest.approx((-0.22, 0.07), abs=0.004)
+    assert found.profile.time_offset_s == pytest.approx(setup.time_offset_s, abs=2e-4)
+    assert found.residual_px < 1.2 * setup.noise_px

@@ -361,14 +361,19 @@ def _fit_with_translation(
 ) -> TrackFit:
     """Fit with the simplest translation that explains the points: none, the accelerometer's, or a direction.
 
-    No translation is fitted if the requested terms explain the points.
+    No translation is fitted if the requested terms explain the points.  If they explain much of the rest, they are
+    fitted beside the translation, which would otherwise start from a wrong lens.
     """
     plain = fit_tracks(imu, table, start, wanted)
     if plain.scale < EXPLAINED_SCALE:
         return plain
     beside = [term for term in asked if term not in wanted]
-    if beside and (lens := fit_tracks(imu, table, plain.profile, [*wanted, *beside])).scale < EXPLAINED_SCALE:
-        return lens
+    if beside:
+        bent = fit_tracks(imu, table, plain.profile, [*wanted, *beside])
+        if bent.scale < EXPLAINED_SCALE:
+            return bent
+        if bent.scale < TRANSLATION_GAIN * plain.scale:
+            plain, start, wanted = bent, bent.profile, [*wanted, *beside]
     known = integrate_motion(imu, start, translation=True)
     if known.displacement is not None:
         scene = start_scene(imu, known, table, START_INVERSE_DEPTH_PER_M)
