@@ -71,6 +71,7 @@ CASES: dict[str, Case] = {
     "pixel_aspect": Case("1.02", "residuals that grow with the rotation rate in pitch, not in yaw or roll"),
     "focal_drift": Case("0.02", "residuals that grow over time: the lens refocuses"),
     "radial_distortion": Case("-0.06", "residuals that grow with the distance from the picture's centre"),
+    "higher_distortion": Case("0.08", "residuals near the corners only, where k1 cannot bend the picture enough"),
     "principal_point": Case("12,-9", "residuals under roll about the optical axis"),
     "stabilisation": Case("0.6,1.5", "the picture follows less of the fast motion than the gyroscope measures"),
     "scene_depth": Case("1.5", "residuals that follow the camera's travel, not its rotation", (("sway_m", 0.12),)),
