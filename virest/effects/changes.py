@@ -148,11 +148,12 @@ def k1_of(profile: CameraProfile) -> float:
 
 def add_k1(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] to k1."""
-    lens = lens_of(profile)
-    if lens.model == "none":
-        lens = replace(lens, model="radtan", coefficients=(0.0,) * 5)
-    coefficients = (lens.coefficients[0] + float(v[0]), *lens.coefficients[1:])
-    return replace(profile, intrinsics=replace(lens, coefficients=coefficients))
+    return _with_coefficient(profile, 0, k1_of(profile) + float(v[0]))
+
+
+def keep_k1(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+    """The profile with the given lens's k1; without any distortion it has the given lens's model."""
+    return _with_kept(profile, given, 0, k1_of(given))
 
 
 def k2_of(profile: CameraProfile) -> float:
@@ -163,27 +164,31 @@ def k2_of(profile: CameraProfile) -> float:
 
 def add_k2(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] to k2."""
-    profile = add_k1(profile, np.zeros(1))
-    lens = lens_of(profile)
-    first, second, *others = lens.coefficients
-    return replace(profile, intrinsics=replace(lens, coefficients=(first, second + float(v[0]), *others)))
-
-
-def keep_k1(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
-    """The profile with k1 of the given lens; a lens without distortion stays one."""
-    return _plain_again(add_k1(profile, np.array([k1_of(given) - k1_of(profile)])), given)
+    return _with_coefficient(profile, 1, k2_of(profile) + float(v[0]))
 
 
 def keep_k2(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
-    """The same with k2."""
-    return _plain_again(add_k2(profile, np.array([k2_of(given) - k2_of(profile)])), given)
+    """As :func:`keep_k1`, for k2."""
+    return _with_kept(profile, given, 1, k2_of(given))
 
 
-def _plain_again(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
-    lens, before = lens_of(profile), given.intrinsics
-    if before is None or before.model != "none" or any(lens.coefficients):
+def _with_coefficient(profile: CameraProfile, number: int, value: float) -> CameraProfile:
+    """The profile with one coefficient of its lens changed; a lens without distortion becomes radial-tangential."""
+    lens = lens_of(profile)
+    if lens.model == "none":
+        lens = replace(lens, model="radtan", coefficients=(0.0,) * 5)
+    coefficients = (*lens.coefficients[:number], value, *lens.coefficients[number + 1 :])
+    return replace(profile, intrinsics=replace(lens, coefficients=coefficients))
+
+
+def _with_kept(profile: CameraProfile, given: CameraProfile, number: int, value: float) -> CameraProfile:
+    if profile.intrinsics is None:
         return profile
-    return replace(profile, intrinsics=replace(lens, model="none", coefficients=before.coefficients))
+    kept = _with_coefficient(profile, number, value)
+    lens, before = lens_of(kept), given.intrinsics
+    if before is None or before.model != "none" or any(lens.coefficients):
+        return kept
+    return replace(kept, intrinsics=replace(lens, model="none", coefficients=before.coefficients))
 
 
 def shift_principal_point(profile: CameraProfile, v: Array) -> CameraProfile:

@@ -106,9 +106,9 @@ def _sharp_differences(
     recorded: from :func:`_small_differences`.
 
     Blur is linear, so the part of a difference that is proportional to the luma nearby is so in the sharp picture too,
-    if the slope is constant over a path; the luma is restored with a better prior.  Proportional is the luma's
-    deviation from its local mean: slopes scatter where the luma is plain, and times the luma itself they would put that
-    scatter into the rest.  The rest is restored by the measured Wiener filter.
+    if the slope is constant over a path; the luma is restored with a better prior.  The luma enters as
+    its deviation from its local mean: where it is plain, slopes scatter, and a slope times the luma itself would carry
+    that scatter into the rest.  The rest is restored by the measured Wiener filter.
     """
     deconvolution = tile_deconvolution(blurred, COLOUR_TILE_PX, COARSE_OVERLAP, scale)
     luma, differences = recorded

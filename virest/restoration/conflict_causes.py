@@ -137,13 +137,15 @@ def _with_higher_distortion(profile: CameraProfile, found: CameraProfile, std: A
     return profile.with_estimate("k2", k2_of(found), float(std[0]), SOURCE, intrinsics=_with_bent_lens(profile, found))
 
 
-def _is_lens(_: CameraProfile, found: CameraProfile) -> bool:
-    """Whether radii grow up to the corners: r (1 + k₁ r² + k₂ r⁴) does while 1 + 3 k₁ r² + 5 k₂ r⁴ is positive."""
+def _is_lens(given: CameraProfile, found: CameraProfile) -> bool:
+    """Whether the coefficients are plausible and the pictured radius grows up to the corners."""
     lens = found.intrinsics
     assert lens is not None
     corner = np.array([lens.width / lens.fx_px, lens.height / lens.fy_px]) / 2
-    r2, k1, k2 = np.linspace(0.0, float(corner @ corner), LENS_RADII), k1_of(found), k2_of(found)
-    return abs(k1) < 2 * K1_REACH and abs(k2) < 4 * K2_REACH and float(np.min(1 + r2 * (3 * k1 + r2 * 5 * k2))) > 0
+    plane = np.linspace(0.0, 1.0, LENS_RADII)[:, None] * corner
+    radius_px = lens.radius_px(lens.project(np.concatenate([plane, np.ones((LENS_RADII, 1))], axis=1)))
+    added = abs(k2_of(found) - k2_of(given))
+    return abs(k1_of(found)) < 2 * K1_REACH and added < 4 * K2_REACH and bool((np.diff(radius_px, axis=0) > 0).all())
 
 
 def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
