@@ -16,9 +16,9 @@ SPECIAL = {"scene_depth", "frame_lag"}
 
 
 def test_the_simulator_and_the_catalogue_have_the_same_effects() -> None:
-    """Both have the same 27 effects."""
+    """Both have the same 28 effects."""
     assert set(EFFECTS) == set(CATALOGUE)
-    assert len(CATALOGUE) == 27
+    assert len(CATALOGUE) == 28
 
 
 def test_every_cause_of_the_catalogue_has_a_test() -> None:
