@@ -312,8 +312,8 @@ class _Rough:
 def _readout_axis(imu: ImuSamples, table: TrackTable, start: CameraProfile, names: Sequence[str]) -> _Rough:
     """Fit a readout of either sign along rows and along columns, and keep the better axis.
 
-    names: optional values of the joint fit.  Except for the focal length, they are fitted here only if the points then
-    need no translation, since a wrong lens alone looks like translation.
+    names: optional values of the joint fit.  Except for the focal length, they are fitted here only if they explain
+    much of what rotation leaves, since a wrong lens looks like translation.
     """
     asked = _optional(names)
     wanted = [terms_of.TIME_OFFSET, terms_of.GYRO_BIAS, terms_of.IMU_ROTATION]

@@ -9,7 +9,7 @@ import numpy as np
 
 from virest.arrays import Array
 from virest.capture.imu import ImuSamples
-from virest.effects.table import EFFECTS
+from virest.effects.table import EFFECTS, is_sought
 from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
 from virest.inference.track_fit import TrackFit, fit_tracks
@@ -72,7 +72,7 @@ def held_values(
     """Fit once more with all optional terms free: the values that ``fit`` held fixed, by key of OPTIONAL.
 
     noise_px: tracking noise.  exposures_vary: if not, an exposure scale is indistinguishable from a time offset and is
-    left out.  A value that refines another is free only if ``fit`` fitted that one.
+    left out.  A value that refines another is free only beside that one.
     """
     fitted = {term.name for term in fit.terms}
     wanted = {
@@ -80,7 +80,7 @@ def held_values(
         for name, term in OPTIONAL.items()
         if term.name not in fitted
         and (exposures_vary or name != "exposure-scale")
-        and EFFECTS[term.name].beside in {"", *fitted}
+        and is_sought(term.name, fitted, fit.profile)
     }
     free = fit_tracks(imu, table, fit.profile, [*fit.terms, *wanted.values()], fit.scene)
     return {

@@ -9,8 +9,9 @@ import numpy as np
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
-from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect, geometric_effect
+from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffect
 from virest.diagnosis.geometric_evidence import Evidence, Model, base_scene, free_scene
+from virest.effects.table import is_sought
 from virest.image_formation.point_model import TrackTable, integrate_motion, predict
 from virest.inference.recorder_lag import Schedule
 from virest.inference.track_fit import Term
@@ -101,8 +102,7 @@ def candidates_of(
         unknowable = effect.name == "exposure_time" and not varies(evidence.observed.exposure_s)
         if effect.name in tried or effect.name in in_terms or unknowable:
             continue
-        coarser = effect.effect.beside
-        if coarser and not (coarser in tried | in_terms or geometric_effect(coarser).is_in(nominal)):
+        if not is_sought(effect.name, tried | in_terms, nominal):
             continue
         if effect.term is None:
             found += _word_candidates(effect, model)

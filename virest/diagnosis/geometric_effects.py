@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.diagnosis.findings import ParameterChange
@@ -42,10 +40,6 @@ class GeometricEffect:
     def starts(self) -> tuple[tuple[float, ...], ...]:
         """Starting changes of the term's values, besides 0."""
         return () if self.effect.steps is None else self.effect.steps.starts
-
-    def is_in(self, profile: CameraProfile) -> bool:
-        """Whether a profile has a value of it other than 0."""
-        return any(np.any(value) for value in self.effect.read(profile, profile).values())
 
     def total_change(self, nominal: CameraProfile, found: CameraProfile) -> Array:
         """Change (k,) of the term's values between two profiles."""

@@ -142,8 +142,12 @@ def pixel_aspect(profile: CameraProfile) -> float:
 
 def k1_of(profile: CameraProfile) -> float:
     """First radial coefficient; 0 without distortion."""
-    lens = profile.intrinsics
-    return 0.0 if lens is None or not lens.coefficients else lens.coefficients[0]
+    return _coefficient(profile, 0)
+
+
+def k2_of(profile: CameraProfile) -> float:
+    """Second radial coefficient; 0 without distortion."""
+    return _coefficient(profile, 1)
 
 
 def add_k1(profile: CameraProfile, v: Array) -> CameraProfile:
@@ -151,25 +155,29 @@ def add_k1(profile: CameraProfile, v: Array) -> CameraProfile:
     return _with_coefficient(profile, 0, k1_of(profile) + float(v[0]))
 
 
-def keep_k1(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
-    """The profile with the given lens's k1; without any distortion it has the given lens's model."""
-    return _with_kept(profile, given, 0, k1_of(given))
-
-
-def k2_of(profile: CameraProfile) -> float:
-    """Second radial coefficient; 0 without distortion."""
-    lens = profile.intrinsics
-    return 0.0 if lens is None or not lens.coefficients else lens.coefficients[1]
-
-
 def add_k2(profile: CameraProfile, v: Array) -> CameraProfile:
     """Add v[0] to k2."""
     return _with_coefficient(profile, 1, k2_of(profile) + float(v[0]))
 
 
-def keep_k2(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
-    """As :func:`keep_k1`, for k2."""
-    return _with_kept(profile, given, 1, k2_of(given))
+def keep_coefficient(number: int) -> Callable[[CameraProfile, CameraProfile], CameraProfile]:
+    """A function that restores a coefficient of a given lens, and its model where no distortion is left."""
+
+    def keep(profile: CameraProfile, given: CameraProfile) -> CameraProfile:
+        if profile.intrinsics is None:
+            return profile
+        kept = _with_coefficient(profile, number, _coefficient(given, number))
+        lens, before = lens_of(kept), given.intrinsics
+        if before is None or before.model != "none" or any(lens.coefficients):
+            return kept
+        return replace(kept, intrinsics=replace(lens, model="none", coefficients=before.coefficients))
+
+    return keep
+
+
+def _coefficient(profile: CameraProfile, number: int) -> float:
+    lens = profile.intrinsics
+    return 0.0 if lens is None or not lens.coefficients else lens.coefficients[number]
 
 
 def _with_coefficient(profile: CameraProfile, number: int, value: float) -> CameraProfile:
@@ -179,16 +187,6 @@ def _with_coefficient(profile: CameraProfile, number: int, value: float) -> Came
         lens = replace(lens, model="radtan", coefficients=(0.0,) * 5)
     coefficients = (*lens.coefficients[:number], value, *lens.coefficients[number + 1 :])
     return replace(profile, intrinsics=replace(lens, coefficients=coefficients))
-
-
-def _with_kept(profile: CameraProfile, given: CameraProfile, number: int, value: float) -> CameraProfile:
-    if profile.intrinsics is None:
-        return profile
-    kept = _with_coefficient(profile, number, value)
-    lens, before = lens_of(kept), given.intrinsics
-    if before is None or before.model != "none" or any(lens.coefficients):
-        return kept
-    return replace(kept, intrinsics=replace(lens, model="none", coefficients=before.coefficients))
 
 
 def shift_principal_point(profile: CameraProfile, v: Array) -> CameraProfile:

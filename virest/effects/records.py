@@ -97,7 +97,7 @@ class Effect:
     calibrated: Calibrated | None = None
     """None: not a value of ``virest calibrate``."""
     beside: str = ""
-    """The effect that it refines: tried only where the model or the profile has that one; empty: it stands alone."""
+    """The effect that it refines, see :func:`virest.effects.table.is_sought`; empty: it stands alone."""
     applied: Callable[[CameraProfile], str] = lambda profile: ""
     """Log line on how restoration handles it; empty: the profile lacks it, or states it as one of its plain values."""
 

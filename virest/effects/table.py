@@ -9,7 +9,7 @@ strong denoiser does, and the amount depends more on the encoder than on the den
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -349,7 +349,7 @@ _POINTS = (
         "the lens bends straight lines",
         "the lens has a radial distortion of k1 = {k1}",
         Steps(by.add_k1, _difference(by.k1_of), (1e-3,), (0.1,), (0.5,), 0.8),
-        calibrated=Calibrated("k1", by.k1_of, by.keep_k1, 0.03, "distortion", 0.3),
+        calibrated=Calibrated("k1", by.k1_of, by.keep_coefficient(0), 0.03, "distortion", 0.3),
     ),
     Effect(
         "higher_distortion",
@@ -359,7 +359,7 @@ _POINTS = (
         "a wide lens bends straight lines less, or more, towards the corners than k1 alone does",
         "beyond k1, the lens has a radial distortion of k2 = {k2}",
         Steps(by.add_k2, _difference(by.k2_of), (1e-3,), (0.1,), (0.5,), 0.8),
-        calibrated=Calibrated("k2", by.k2_of, by.keep_k2, 0.03, "higher-distortion", 0.3),
+        calibrated=Calibrated("k2", by.k2_of, by.keep_coefficient(1), 0.03, "higher-distortion", 0.3),
         beside="radial_distortion",
     ),
     Effect(
@@ -500,3 +500,11 @@ _LIGHT = (
 
 EFFECTS: dict[str, Effect] = {effect.name: effect for effect in (*_POINTS, *_LIGHT)}
 """By name."""
+
+
+def is_sought(name: str, fitted: Collection[str], profile: CameraProfile) -> bool:
+    """Whether an effect stands alone, or refines one that is among the fitted ones or in the profile."""
+    coarser = EFFECTS[name].beside
+    if not coarser or coarser in fitted:
+        return True
+    return any(np.any(value) for value in EFFECTS[coarser].read(profile, profile).values())

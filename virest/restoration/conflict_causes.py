@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from virest.arrays import Array
-from virest.camera.intrinsics import Intrinsics
 from virest.camera.profile import CameraProfile
 from virest.effects.changes import k1_of, k2_of, mean_gyro_scale
 from virest.effects.table import GYRO_SCALE_OFF
@@ -115,26 +114,22 @@ def _with_gyro_scale(profile: CameraProfile, found: CameraProfile, std: Array) -
     return profile.with_estimate("gyro_scale", list(scale), spread, SOURCE, gyro_scale=scale)
 
 
-def _distortions(_: TrackTable) -> Array:
-    return np.linspace(-K1_REACH, K1_REACH, K1_STEPS)[:, None]
+def _distortion(name: str, key: str, term: Term, steps: Array, read: Callable[[CameraProfile], float]) -> Cause:
+    """A wrong radial coefficient, ``key`` in the profile; steps (n,): its starting changes."""
 
+    def adopt(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
+        assert profile.intrinsics is not None
+        assert found.intrinsics is not None
+        lens = replace(profile.intrinsics, model=found.intrinsics.model, coefficients=found.intrinsics.coefficients)
+        return profile.with_estimate(key, read(found), float(std[0]), SOURCE, intrinsics=lens)
 
-def _higher_distortions(_: TrackTable) -> Array:
-    return np.linspace(-K2_REACH, K2_REACH, K2_STEPS)[:, None]
+    def message(given: CameraProfile, found: CameraProfile, std: Array) -> str:
+        told = f"radial distortion of {key} = {read(found):+.4f} ± {std[0]:.4f}"
+        return f"{told} used instead of the profile's {read(given):+g}"
 
-
-def _with_bent_lens(profile: CameraProfile, found: CameraProfile) -> Intrinsics:
-    assert profile.intrinsics is not None
-    assert found.intrinsics is not None
-    return replace(profile.intrinsics, model=found.intrinsics.model, coefficients=found.intrinsics.coefficients)
-
-
-def _with_distortion(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
-    return profile.with_estimate("k1", k1_of(found), float(std[0]), SOURCE, intrinsics=_with_bent_lens(profile, found))
-
-
-def _with_higher_distortion(profile: CameraProfile, found: CameraProfile, std: Array) -> CameraProfile:
-    return profile.with_estimate("k2", k2_of(found), float(std[0]), SOURCE, intrinsics=_with_bent_lens(profile, found))
+    return Cause(
+        name, term, lambda _: steps[:, None], _is_lens, lambda given, found: read(found) - read(given), adopt, message
+    )
 
 
 def _is_lens(given: CameraProfile, found: CameraProfile) -> bool:
@@ -193,30 +188,8 @@ CAUSES = (
             f"clock skew of {found.clock_skew:+.5f} ± {std[0]:.5f} used instead of the profile's {given.clock_skew:+g}"
         ),
     ),
-    Cause(
-        "radial distortion",
-        terms_of.K1,
-        _distortions,
-        _is_lens,
-        lambda given, found: k1_of(found) - k1_of(given),
-        _with_distortion,
-        lambda given, found, std: (
-            f"radial distortion of k1 = {k1_of(found):+.4f} ± {std[0]:.4f} used "
-            f"instead of the profile's {k1_of(given):+g}"
-        ),
-    ),
-    Cause(
-        "higher distortion",
-        terms_of.K2,
-        _higher_distortions,
-        _is_lens,
-        lambda given, found: k2_of(found) - k2_of(given),
-        _with_higher_distortion,
-        lambda given, found, std: (
-            f"radial distortion of k2 = {k2_of(found):+.4f} ± {std[0]:.4f} used beside k1 "
-            f"instead of the profile's {k2_of(given):+g}"
-        ),
-    ),
+    _distortion("radial distortion", "k1", terms_of.K1, np.linspace(-K1_REACH, K1_REACH, K1_STEPS), k1_of),
+    _distortion("higher distortion", "k2", terms_of.K2, np.linspace(-K2_REACH, K2_REACH, K2_STEPS), k2_of),
     Cause(
         "stabilisation",
         terms_of.STABILISATION,

@@ -16,7 +16,7 @@ import numpy as np
 from virest.arrays import Array, Index, Mask
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
-from virest.effects.changes import k1_of
+from virest.effects.table import is_sought
 from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.image_formation.row_clock import as_global_shutter, right_way_round
 from virest.inference.chance import chance_of, chi2_tail
@@ -51,7 +51,7 @@ MOST_LEFT = 0.5
 HELD_OUT_P = 0.05
 """Significance level, one-sided, of the mean gain on held-out blocks (Student's t): a fit must predict other blocks."""
 VALUE_P = 1e-5
-"""Significance level of a value, with the tracking bias included in its deviation: with at most twelve trials, a
+"""Significance level of a value, with the tracking bias included in its deviation: with at most fourteen trials, a
 false cause is found in about one capture of ten thousand."""
 READOUT_DOUBT_S = 0.001
 """Replace a stated readout time that differs by at least this much, s: the first and last rows are then displaced by
@@ -60,7 +60,7 @@ outside, as phones film, and 6 real) none differs by more than 3.7 deviations.""
 TOLD_SIGMA = 3.0
 """A cause is distinguished from its twin if, fitted beside it, it remains above this many standard deviations."""
 MAX_CAUSES = 3
-"""Of the five causes, two of which are twins, and k₂ beside k₁.  Their rounds have 5 + 4 + 3 trials."""
+"""Of the five causes, two of which are twins, and k₂ beside k₁.  Their rounds have at most 5 + 5 + 4 trials."""
 JUDGED = 2
 """Number of causes with plausible values tested on held-out blocks in each round, those that fit best."""
 MOST_BENT = 0.2
@@ -285,10 +285,12 @@ class _Search:
         """The cause with a plausible value that predicts held-out blocks best, if significantly better than none."""
         fitted = {term.name for term in (*self.nuisances, *(cause.term for cause in here.causes))}
         left = fit.scale * float(np.median(self.table.noise_px)) / _motion_px(self.table)
-        bent = K1.name in fitted or k1_of(here.profile) != 0
-        possible = {K1.name: left < MOST_BENT, K2.name: left < MOST_BENT and bent}
         open_causes = [
-            cause for cause in CAUSES if cause.term.name not in fitted and possible.get(cause.term.name, True)
+            cause
+            for cause in CAUSES
+            if cause.term.name not in fitted
+            and is_sought(cause.term.name, fitted, here.profile)
+            and (cause.term not in (K1, K2) or left < MOST_BENT)
         ]
         tried = [best for cause in open_causes if (best := self._best(here, fit, cause)) is not None]
         better = [one for one in tried if one[1].cost < fit.cost and one[1].scale < fit.scale and self._has_value(*one)]
