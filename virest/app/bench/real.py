@@ -43,7 +43,8 @@ def real_section(work: Path, _scale: Scale) -> tuple[dict[str, Any], str]:
     text += "\n\n" + numeric_table(
         ["diagnose", "verdict", "cause", "found", "std", "before", "after", "rivals"], diagnosed
     )
-    return {"process": processed, "calibrate": calibrated, "diagnose": diagnosed}, f"Measured captures, process with preset {PRESET}\n{text}"
+    title = f"Measured captures, process with preset {PRESET}"
+    return {"process": processed, "calibrate": calibrated, "diagnose": diagnosed}, f"{title}\n{text}"
 
 
 def _processed(folder: Path, work: Path) -> Row:
