@@ -77,6 +77,7 @@ OTHER_EXTENSION: dict[str, Any] = {
     "focal_drift_per_s": 0.03,
     "stabilisation_fraction": 0.7,
     "stabilisation_cutoff_hz": 1.4,
+    "stabilisation_travel_rad": 0.005,
     "stabilisation_lean_rad": (0.01, -0.02),
     "frame_lag_s": 0.1,
     "frame_lag_frames": 3,
@@ -177,7 +178,7 @@ def test_every_sentence_can_be_filled_and_every_unit_is_known() -> None:
              "k2", "pixel_aspect", "axis_scale", "fraction", "frames", "gamma", "black_level", "corner_loss",
              "amplitude", "gain", "amount"}  # fmt: skip
     for effect in EFFECTS.values():
-        assert effect.sentence.format(**{parameter.name: 1.0 for parameter in effect.parameters})
+        assert (effect.sentence + effect.addition).format(**{parameter.name: 1.0 for parameter in effect.parameters})
         assert effect.in_words
         for parameter in effect.parameters:
             assert any(parameter.name.endswith(unit) for unit in UNITS) != (parameter.name in plain), parameter.name
@@ -189,7 +190,7 @@ def test_values_follow_their_steps(name: str) -> None:
     effect = EFFECTS[name]
     assert effect.steps is not None
     profile = recorded(SWAYING).profile
-    profile = replace(profile, extensions=replace(profile.extensions, gyro_lowpass_hz=20.0))
+    profile = profile.with_extensions(gyro_lowpass_hz=20.0, stabilisation_travel_rad=0.02)
     for step in np.diag(1e-3 * np.array(effect.steps.quotient)):
         before, after = (effect.read(p, profile) for p in (profile, effect.steps.change(profile, step)))
         for parameter, size in effect.spread(before, step).items():

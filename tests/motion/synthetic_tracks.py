@@ -60,6 +60,8 @@ class Setup:
     focal_drift_per_s: float = 0.0
     stabilised: tuple[float, float] = (0.0, 1.0)
     """Fraction and cutoff in Hz of the lens's stabiliser."""
+    travel_rad: float | None = None
+    """Its largest shift; None: no ends."""
     time_offset_s: float = 0.013
     clock_skew: float = 0.0
     gyro_bias_rad_s: Triple = (0.004, -0.006, 0.003)
@@ -209,7 +211,12 @@ class Recording:
             gyro_bias_rad_s=s.gyro_bias_rad_s,
             gyro_scale=(s.gyro_scale,) * 3,
             depth_m=np.inf,
-            extensions=Extensions(s.focal_drift_per_s, *s.stabilised, gyro_lowpass_hz=s.gyro_lowpass_hz),
+            extensions=Extensions(
+                s.focal_drift_per_s,
+                *s.stabilised,
+                gyro_lowpass_hz=s.gyro_lowpass_hz,
+                stabilisation_travel_rad=s.travel_rad,
+            ),
         )
 
     @cached_property
@@ -292,7 +299,8 @@ class Recording:
         time_s = np.arange(self.imu.time_s[0], self.imu.time_s[-1], 2e-4)
         decay = np.exp(-2 * np.pi * cutoff_hz * 2e-4)
         theta = lfilter([2e-4 * np.sqrt(decay)], [1.0, -decay], self.rate(time_s + 1e-4), axis=0)
-        return time_s + 2e-4, fraction * theta[:, [1, 0]] * (1.0, -1.0)
+        end = np.inf if self.setup.travel_rad is None else self.setup.travel_rad
+        return time_s + 2e-4, np.clip(fraction * theta[:, [1, 0]] * (1.0, -1.0), -end, end)
 
     @property
     def _middle(self) -> Array:

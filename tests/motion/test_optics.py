@@ -141,14 +141,16 @@ def test_projection_inverts_rays_at_every_time(lens: tuple[str, tuple[float, ...
     np.testing.assert_array_equal(cut.rays(pixels(), time_s), moving.rays(pixels(), time_s))
 
 
+@pytest.mark.parametrize("travel_rad", [None, 0.02])
 @pytest.mark.parametrize("lens", LENSES)
-def test_rays_match_the_simulator(lens: tuple[str, tuple[float, ...]]) -> None:
+def test_rays_match_the_simulator(lens: tuple[str, tuple[float, ...]], travel_rad: float | None) -> None:
     """Drift and stabiliser apply in the simulator's order: shift before distortion, drift of the complete frame."""
     profile = extended(
         phone(lens=lens, time_offset_s=0.0),
         focal_drift_per_s=0.02,
         stabilisation_fraction=0.7,
         stabilisation_cutoff_hz=0.8,
+        stabilisation_travel_rad=travel_rad,
     )
     moving = moving_lens(sampled(HAND, profile, -0.6, 1.0), profile)
     view = make_view(profile, HAND, rest_s=-0.6)

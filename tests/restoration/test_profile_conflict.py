@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from motion.synthetic_tracks import Recording, Setup, recorded
 
@@ -88,6 +89,21 @@ def test_an_unlisted_stabiliser_is_found(fraction: float) -> None:
     assert found.profile.extensions.stabilisation_cutoff_hz == pytest.approx(0.8, rel=0.15)
     assert len(found.taken) == 1
     assert set(found.profile.estimates) == {"stabilisation_fraction", "stabilisation_cutoff_hz"}
+
+
+@pytest.mark.parametrize(("travel_rad", "cutoff_hz"), [(0.012, 0.5), (0.02, 0.3)])
+def test_a_stabiliser_at_the_end_of_its_travel_is_found(travel_rad: float, cutoff_hz: float) -> None:
+    """The lens rests at an end for part of the time; one without ends explains little of the motion."""
+    recording = recorded(replace(HAND, stabilised=(0.9, cutoff_hz), travel_rad=travel_rad))
+    at_end = np.isclose(np.abs(recording._shift[1]), travel_rad).mean()
+    assert 0.1 < at_end < 0.9
+    found = settled(recording, replace(recording.profile, extensions=Extensions()))
+    ext = found.profile.extensions
+    assert ext.stabilisation_fraction == pytest.approx(0.9, abs=0.03)
+    assert ext.stabilisation_cutoff_hz == pytest.approx(cutoff_hz, rel=0.15)
+    assert ext.stabilisation_travel_rad == pytest.approx(travel_rad, rel=0.03)
+    assert found.after_px < 1.2 * found.noise_px < found.before_px
+    assert "rad, used instead" in found.taken[0]
 
 
 @pytest.mark.parametrize("seed", [71, 73, 75])

@@ -181,6 +181,15 @@ def test_a_full_stabiliser_cancels_fast_pitch_and_yaw():
     assert np.linalg.norm(centroid_px(instant(scene, motion, plain, 0.1)) - at_rest) > 5
 
 
+def test_a_stabiliser_stops_at_the_end_of_its_travel():
+    """After 0.1 s at 0.3 and 0.5 rad/s the lens has cancelled 0.02 rad about each axis; the rest moves the picture."""
+    held = Extensions(stabilisation_fraction=1.0, stabilisation_cutoff_hz=1e-4, stabilisation_travel_rad=0.02)
+    profile, motion, scene = replace(camera(), extensions=held), constant_motion((0.3, -0.5, 0.0)), spot_scene()
+    limited, plain = make_view(profile, motion, rest_s=0.0), make_view(camera(), motion)
+    moved = centroid_px(instant(scene, motion, limited, 0.1)) - centroid_px(instant(scene, motion, plain, 0.1))
+    assert moved == pytest.approx(FOCAL * 0.02 * np.array([-1.0, -1.0]), abs=0.1)
+
+
 def test_the_high_pass_follows_its_closed_form():
     """A constant rate from rest gives ω/c (1 − exp(−c t)), c = 2π cutoff."""
     motion = constant_motion((0.4, -0.7, 0.0), start_s=-0.1, end_s=0.9)

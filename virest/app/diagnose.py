@@ -267,7 +267,7 @@ def extended_text(name: str, found: Diagnosis) -> str:
     profile = found.extended_profile
     for cause in found.causes:
         for parameter, change in cause.parameters.items():
-            if np.size(change.estimate) <= SHOWN_COMPONENTS:
+            if change.estimate is not None and np.size(change.estimate) <= SHOWN_COMPONENTS:
                 estimate, std = plain(change.estimate), _plain_std(change.std)
                 profile = profile.with_estimate(parameter, estimate, std, f"virest diagnose, {cause.name}")
     fields = [f"{field.kind} over {', '.join(field.covariates)}" for field in found.fields]

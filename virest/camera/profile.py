@@ -64,6 +64,8 @@ class Extensions:
     """Rows by which exposure times and ISO values are logged late: frame k's are in row k + this many."""
     exposure_gain: tuple[float, ...] = ()
     """Factors on the logged exposure times of frames, by movie index; 1 where the list has none."""
+    stabilisation_travel_rad: float | None = None
+    """Largest shift of the lens along each axis, as an angle; None: it never reaches an end."""
     stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
     """θ about x and y at the start of the inertial log; fitted but not stored in files: its effect decays soon."""
     field: tuple[ModelField, ...] = ()

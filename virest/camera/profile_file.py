@@ -85,6 +85,7 @@ def _from_model(model: ProfileFile) -> CameraProfile:
             focal_drift_per_s=extensions.focal_drift.focal_drift_per_s,
             stabilisation_fraction=extensions.stabilisation.fraction,
             stabilisation_cutoff_hz=extensions.stabilisation.cutoff_hz,
+            stabilisation_travel_rad=extensions.stabilisation.travel_rad,
             frame_lag_s=extensions.frame_lag.lag_s,
             frame_lag_frames=extensions.frame_lag.frames,
             exposures_late_frames=extensions.exposures_late_frames,
@@ -214,6 +215,8 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
             "fraction": ext.stabilisation_fraction,
             "cutoff_hz": ext.stabilisation_cutoff_hz,
         }
+        if ext.stabilisation_travel_rad is not None:
+            extensions["stabilisation"]["travel_rad"] = ext.stabilisation_travel_rad
     if ext.frame_lag_frames:
         extensions["frame_lag"] = {"lag_s": ext.frame_lag_s, "frames": ext.frame_lag_frames}
     if ext.exposures_late_frames:

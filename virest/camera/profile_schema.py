@@ -144,6 +144,7 @@ class _FocalDrift(_Strict):
 class _Stabilisation(_Strict):
     fraction: Annotated[Number, Field(ge=-2, le=2)] = 0.0
     cutoff_hz: Positive = 1.0
+    travel_rad: Positive | None = None
 
 
 class _FrameLag(_Strict):

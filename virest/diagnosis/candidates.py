@@ -13,7 +13,9 @@ from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS, GeometricEffec
 from virest.diagnosis.geometric_evidence import Evidence, Model, base_scene, free_scene
 from virest.effects.table import is_sought
 from virest.image_formation.point_model import TrackTable, integrate_motion, predict
+from virest.inference.profile_terms import STABILISATION
 from virest.inference.recorder_lag import Schedule
+from virest.inference.stabiliser_start import stabiliser_starts
 from virest.inference.track_fit import Term
 from virest.motion.scene_motion import InertialMotion
 
@@ -107,8 +109,8 @@ def candidates_of(
         if effect.term is None:
             found += _word_candidates(effect, model)
             continue
-        for values in (None, *effect.starts):
-            profile = model.profile if values is None else effect.term.change(model.profile, np.array(values))
+        for values in (None, *_starts(evidence, model, effect)):
+            profile = model.profile if values is None else effect.term.change(model.profile, values)
             found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
         far_start = far.start(effect.name, nominal, model.profile, "time_offset" in in_terms)
         if far_start is not None:
@@ -122,6 +124,13 @@ def candidates_of(
     if "frame_lag" not in tried:
         found += [_lag_candidate(model, *lag) for lag in lags]
     return found
+
+
+def _starts(evidence: Evidence, model: Model, effect: GeometricEffect) -> Array:
+    """Starting changes (n, k) of an effect's values, besides 0."""
+    if effect.term is not STABILISATION:
+        return np.array(effect.starts)
+    return stabiliser_starts(evidence.start(model, SCREEN_POINTS, lambda: evidence.table(model, SCREEN_POINTS)))
 
 
 def varies(exposure_s: Array) -> bool:

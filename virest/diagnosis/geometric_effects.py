@@ -47,10 +47,11 @@ class GeometricEffect:
         return self.effect.steps.between(nominal, found)
 
     def changes(self, nominal: CameraProfile, found: CameraProfile, std: Array | None) -> dict[str, ParameterChange]:
-        """The parameters before and after; their standard deviations follow from those of the term's values (k,)."""
+        """The parameters before and after, without those that have no value; deviations from those (k,) of the term."""
         before, after = (self.effect.read(profile, nominal) for profile in (nominal, found))
         spread = {} if std is None else self.effect.spread(after, std)
-        return {name: ParameterChange(before[name], after[name], spread.get(name)) for name in after}
+        held = [name for name in after if before[name] is not None or after[name] is not None]
+        return {name: ParameterChange(before[name], after[name], spread.get(name)) for name in held}
 
 
 GEOMETRIC_EFFECTS = tuple(

@@ -65,11 +65,11 @@ def changes_of(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramete
     if verdict.rival is None or twin is None:
         return changes
     at_rival = _changes_at(verdict.rival, twin)
-    return {name: _widened(change, at_rival[name]) for name, change in changes.items()}
+    return {name: _widened(change, at_rival.get(name)) for name, change in changes.items()}
 
 
-def _widened(change: ParameterChange, at_rival: ParameterChange) -> ParameterChange:
-    if change.std is None or isinstance(change.estimate, str):
+def _widened(change: ParameterChange, at_rival: ParameterChange | None) -> ParameterChange:
+    if change.std is None or at_rival is None or at_rival.std is None:
         return change
     difference = np.subtract(change.estimate, at_rival.estimate) / np.sqrt(2)
     return replace(change, std=np.hypot(change.std, difference).tolist())
@@ -99,8 +99,9 @@ def _changes_at(verdict: GeometricVerdict, entry: Accepted) -> dict[str, Paramet
 
 
 def _sentence(entry: Accepted, changes: dict[str, ParameterChange]) -> str:
-    values = {name: shown(change.estimate) for name, change in changes.items()}
-    return EFFECTS[entry.name].sentence.format(**values)
+    effect = EFFECTS[entry.name]
+    values = {name: shown(change.estimate) for name, change in changes.items() if change.estimate is not None}
+    return (effect.sentence + effect.addition * (len(values) == len(effect.parameters))).format(**values)
 
 
 def shown(value: Any) -> str:

@@ -16,6 +16,8 @@ from virest.errors import SettingsError
 
 CUTOFFS_HZ = (0.02, 20.0)
 """Bounds of a stabiliser's cutoff while it is fitted."""
+LEAST_INVERSE_TRAVEL = 1.0
+"""1/rad: a lens that could tilt the picture by a radian reaches no end."""
 
 
 def lens_of(profile: CameraProfile) -> Intrinsics:
@@ -213,21 +215,31 @@ def drift_focal(profile: CameraProfile, v: Array) -> CameraProfile:
     return profile.with_extensions(focal_drift_per_s=profile.extensions.focal_drift_per_s + float(v[0]))
 
 
+def inverse_travel(profile: CameraProfile) -> float:
+    """1 / travel of the stabiliser, 1/rad; 0 where it has no ends."""
+    travel_rad = profile.extensions.stabilisation_travel_rad
+    return 0.0 if travel_rad is None else 1.0 / travel_rad
+
+
 def stabilise(profile: CameraProfile, v: Array) -> CameraProfile:
-    """Add v[0] to the stabiliser's fraction, multiply its cutoff by exp(v[1]), add v[2:] rad to its initial lean."""
+    """Add v[0] to the stabiliser's fraction, v[2:4] rad to its initial lean and v[4] to 1 / travel (1/rad).
+
+    Its cutoff is multiplied by exp(v[1]).  An inverse travel of 0 has no ends, and the points' slope there is 0.
+    """
     before = profile.extensions
-    lean = before.stabilisation_lean_rad
+    lean, inverse = before.stabilisation_lean_rad, inverse_travel(profile) + float(v[4])
     return profile.with_extensions(
         stabilisation_fraction=before.stabilisation_fraction + float(v[0]),
         stabilisation_cutoff_hz=float(np.clip(before.stabilisation_cutoff_hz * np.exp(v[1]), *CUTOFFS_HZ)),
         stabilisation_lean_rad=(lean[0] + float(v[2]), lean[1] + float(v[3])),
+        stabilisation_travel_rad=1 / inverse if inverse > LEAST_INVERSE_TRAVEL else None,
     )
 
 
 def stabilised_between(before: CameraProfile, after: CameraProfile) -> Array:
-    """(4,) the fraction's change, else 0: a cutoff has no zero to count from, and the lean is not part of the cause."""
+    """(5,) the fraction's change, else 0: only that has a zero to count from, and the lean is not part of the cause."""
     change = after.extensions.stabilisation_fraction - before.extensions.stabilisation_fraction
-    return np.array([change, 0.0, 0.0, 0.0])
+    return np.array([change, 0.0, 0.0, 0.0, 0.0])
 
 
 def skew_clock(profile: CameraProfile, v: Array) -> CameraProfile:

@@ -98,6 +98,8 @@ class Effect:
     """None: not a value of ``virest calibrate``."""
     beside: str = ""
     """The effect that it refines, see :func:`virest.effects.table.is_sought`; empty: it stands alone."""
+    addition: str = ""
+    """Added to the sentence where all parameters have a value."""
     applied: Callable[[CameraProfile], str] = lambda profile: ""
     """Log line on how restoration handles it; empty: the profile lacks it, or states it as one of its plain values."""
 

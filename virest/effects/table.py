@@ -57,6 +57,11 @@ def _of_cutoff(value: Any, std: Array) -> float:
     return float(std[0]) * abs(float(value)) / max(delay_s(value), 1e-9)
 
 
+def _of_travel(value: Any, std: Array) -> float | None:
+    """The step is the inverse of the travel."""
+    return None if value is None else float(std[4]) * float(value) ** 2
+
+
 def _of_root(value: Any, std: Array) -> float:
     """Deviation of a value whose step is its square; near 0 that of the square decides."""
     return float(std[0]) / max(2 * abs(float(value)), float(np.sqrt(std[0])), 1e-12)
@@ -385,19 +390,20 @@ _POINTS = (
         (
             *_value("fraction", _extension("stabilisation_fraction")),
             *_value("cutoff_hz", _extension("stabilisation_cutoff_hz"), _second_relative),
+            *_value("travel_rad", _extension("stabilisation_travel_rad"), _of_travel),
         ),
         "extensions.stabilisation",
         "an optical stabiliser moves the lens",
         "an optical stabiliser cancels {fraction} of the motion above {cutoff_hz} Hz",
-        Steps(
+        steps=Steps(
             by.stabilise,
             by.stabilised_between,
-            (0.02, 0.1, 0.01, 0.01),
-            (0.3, 0.5, 0.1, 0.1),
-            (1.0, 1.5, 0.05, 0.05),
+            (0.02, 0.1, 0.01, 0.01, 0.5),
+            (0.3, 0.5, 0.1, 0.1, 20.0),
+            (1.0, 1.5, 0.05, 0.05, 100.0),
             1.1,
-            ((0.5, 0.0, 0.0, 0.0), (0.5, 1.2, 0.0, 0.0), (0.5, -1.2, 0.0, 0.0)),
         ),
+        addition=", up to {travel_rad} rad",
         applied=_applied(
             "stabilisation_fraction",
             "stabiliser cancelling {e.stabilisation_fraction:g} above {e.stabilisation_cutoff_hz:g} Hz: followed",

@@ -45,7 +45,7 @@ BIAS_STD: dict[str, tuple[float, ...]] = {
     "radial_distortion": (7e-4,),
     "higher_distortion": (2e-3,),
     "principal_point": (0.2, 0.2),
-    "stabilisation": (0.002, 0.02, 0.0, 0.0),
+    "stabilisation": (0.002, 0.02, 0.0, 0.0, 0.0),
     "clock_skew": (1e-5,),
     "exposure_time": (0.015,),
     "scene_depth": (0.004,),

@@ -149,6 +149,8 @@ def moving_lens(
         about_x, about_y = extensions.stabilisation_lean_rad
         forgotten = np.exp(-2 * np.pi * cutoff_hz * (time_s - time_s[0]))
         shift = shift + fraction * forgotten[:, None] * np.array([about_y, -about_x])
+    if extensions.stabilisation_travel_rad is not None:
+        shift = np.clip(shift, -extensions.stabilisation_travel_rad, extensions.stabilisation_travel_rad)
     return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path, swing, zoom)
 
 

@@ -11,8 +11,9 @@ from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.effects.changes import k1_of, k2_of, mean_gyro_scale
 from virest.effects.table import GYRO_SCALE_OFF
-from virest.image_formation.point_model import TrackTable
 from virest.inference import profile_terms as terms_of
+from virest.inference.fit_start import FitStart
+from virest.inference.stabiliser_start import stabiliser_starts
 from virest.inference.track_fit import Term
 
 SOURCE = "tracked points against the gyroscope, which contradict the profile's value"
@@ -21,8 +22,6 @@ SKEW_REACH, SKEW_ERROR_S, MOST_SKEWS = 0.015, 0.01, 61
 of them."""
 FOCAL_REACH, FOCAL_STEPS = 0.95, 20
 """Focal scales tried: the range of the logarithm (factors of 0.39 to 2.6), and their number."""
-FRACTIONS, CUTOFF_STEPS = (0.25, 0.5, 0.8), (-1.2, 0.0, 1.2)
-"""Stabilisers tried: fractions, and cutoffs as logarithms of factors on the profile's."""
 GYRO_REACH, GYRO_STEPS = 0.14, 8
 """Gyroscope scales tried: the range of the logarithm, that of plausible errors, and their number."""
 K1_REACH, K1_STEPS = 0.3, 7
@@ -44,7 +43,7 @@ class Cause:
 
     name: str
     term: Term
-    starts: Callable[[TrackTable], Array]
+    starts: Callable[[FitStart], Array]
     """(n, k) changes of the term's values, as starting points for a fit."""
     plausible: Callable[[CameraProfile, CameraProfile], bool]
     """Whether a phone can have such a value.  Arguments: given profile, fitted one."""
@@ -57,18 +56,14 @@ class Cause:
     """Message about the adopted value.  Arguments: given profile, fitted one, standard deviations (k,)."""
 
 
-def _skews(table: TrackTable) -> Array:
-    span_s = max(float(np.abs(table.second_stamp_s).max()), 0.1)
+def _skews(start: FitStart) -> Array:
+    span_s = max(float(np.abs(start.table.second_stamp_s).max()), 0.1)
     count = min(2 * int(np.ceil(SKEW_REACH * span_s / (2 * SKEW_ERROR_S))) + 1, MOST_SKEWS)
     return np.linspace(-SKEW_REACH, SKEW_REACH, max(count, 5))[:, None]
 
 
-def _focal_scales(_: TrackTable) -> Array:
+def _focal_scales(_: FitStart) -> Array:
     return np.linspace(-FOCAL_REACH, FOCAL_REACH, FOCAL_STEPS)[:, None]
-
-
-def _stabilisers(_: TrackTable) -> Array:
-    return np.array([(fraction, step, 0.0, 0.0) for fraction in FRACTIONS for step in CUTOFF_STEPS])
 
 
 def _focal_px(profile: CameraProfile) -> float:
@@ -95,12 +90,27 @@ def _with_stabiliser(profile: CameraProfile, found: CameraProfile, std: Array) -
         stabilisation_fraction=fraction,
         stabilisation_cutoff_hz=cutoff_hz,
         stabilisation_lean_rad=ext.stabilisation_lean_rad,
+        stabilisation_travel_rad=ext.stabilisation_travel_rad,
     )
     taken = profile.with_estimate("stabilisation_fraction", fraction, float(std[0]), SOURCE, extensions=extensions)
-    return taken.with_estimate("stabilisation_cutoff_hz", cutoff_hz, cutoff_hz * float(std[1]), SOURCE)
+    taken = taken.with_estimate("stabilisation_cutoff_hz", cutoff_hz, cutoff_hz * float(std[1]), SOURCE)
+    travel_rad = ext.stabilisation_travel_rad
+    if travel_rad is None:
+        return taken
+    return taken.with_estimate("stabilisation_travel_rad", travel_rad, float(std[4]) * travel_rad**2, SOURCE)
 
 
-def _gyro_scales(_: TrackTable) -> Array:
+def _stabiliser_message(given: CameraProfile, found: CameraProfile, std: Array) -> str:
+    ext, travel_rad = found.extensions, found.extensions.stabilisation_travel_rad
+    cancelled = f"{ext.stabilisation_fraction:.3f} ± {std[0]:.3f} of the shake"
+    ends = "" if travel_rad is None else f", up to {travel_rad:.2g} rad,"
+    return (
+        f"stabiliser that cancels {cancelled} above {ext.stabilisation_cutoff_hz:.2g} Hz{ends} used instead of the "
+        f"profile's {given.extensions.stabilisation_fraction:g}"
+    )
+
+
+def _gyro_scales(_: FitStart) -> Array:
     return np.linspace(-GYRO_REACH, GYRO_REACH, GYRO_STEPS)[:, None]
 
 
@@ -193,14 +203,10 @@ CAUSES = (
     Cause(
         "stabilisation",
         terms_of.STABILISATION,
-        _stabilisers,
+        stabiliser_starts,
         _is_stabiliser,
         lambda given, found: found.extensions.stabilisation_fraction - given.extensions.stabilisation_fraction,
         _with_stabiliser,
-        lambda given, found, std: (
-            f"stabiliser that cancels {found.extensions.stabilisation_fraction:.3f} ± {std[0]:.3f} of the shake above "
-            f"{found.extensions.stabilisation_cutoff_hz:.2g} Hz used instead of the profile's "
-            f"{given.extensions.stabilisation_fraction:g}"
-        ),
+        _stabiliser_message,
     ),
 )

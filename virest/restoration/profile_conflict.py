@@ -21,6 +21,7 @@ from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.image_formation.row_clock import as_global_shutter, right_way_round
 from virest.inference.chance import chance_of, chi2_tail
 from virest.inference.coarse_alignment import MIN_PAIRS
+from virest.inference.fit_start import FitStart
 from virest.inference.hold_out import distances, group_means, loss
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.profile_terms import (
@@ -307,7 +308,7 @@ class _Search:
         starts = [
             cause.term.change(profile, step)
             for profile in (here.profile, fit.profile)
-            for step in cause.starts(self.table)
+            for step in cause.starts(FitStart(self.imu, self.table, profile, here.scene))
         ]
         if cause.term is CLOCK_SKEW:
             middle_s = float(np.mean(self.table.second_stamp_s))

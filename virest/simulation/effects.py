@@ -84,7 +84,8 @@ def hide_effects(
             values = _parse_values(name, effect, value, values, context)
         true = effect.apply(true, values)
         listed = effect.per_frame or len(effect.parameters) != len(values)
-        shown = {effect.parameters[0]: values} if listed else dict(zip(effect.parameters, values, strict=True))
+        named = zip(effect.parameters, values, strict=not listed)
+        shown = {effect.parameters[0]: values} if listed else {key: v for key, v in named if v is not None}
         applied.append(AppliedEffect(name, shown))
     return true, tuple(applied)
 
@@ -276,9 +277,11 @@ _BY_NAME: dict[str, Effect] = {
         _shift_principal_point,
     ),
     "stabilisation": Effect(
-        lambda p, c: [_between(c, 0.4, 0.8), _between(c, 0.5, 1.5)],
-        lambda p, v: p.with_extensions(stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1]),
-        optional=1,
+        lambda p, c: [_between(c, 0.4, 0.8), _between(c, 0.5, 1.5), None],
+        lambda p, v: p.with_extensions(
+            stabilisation_fraction=v[0], stabilisation_cutoff_hz=v[1], stabilisation_travel_rad=v[2]
+        ),
+        optional=2,
     ),
     "scene_depth": Effect(
         lambda p, c: [_between(c, 0.4, 0.9)], lambda p, v: replace(p, depth_m=v[0]), allow_infinity=True

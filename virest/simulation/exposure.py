@@ -46,10 +46,10 @@ class View:
     """Derivative of x with respect to s for a focal length f / (1 − s); None if the focal length is constant."""
     y_rate: Image | None
     """The same for y."""
-    filter_s: Array
-    """Times of the stabiliser angles; empty without a stabiliser."""
-    filter_rad: Array
-    """(n, 2) high-passed pitch and yaw, camera axes x and y."""
+    lens_s: Array
+    """Times of the stabiliser's angles; empty without a stabiliser."""
+    lens_rad: Array
+    """(n, 2) pitch and yaw that it cancels, camera axes x and y."""
     hidden: Hidden = NOTHING
 
     def rays(self, time_s: float, rows: slice, columns: slice) -> tuple[Image, Image]:
@@ -61,10 +61,9 @@ class View:
             shrinking = np.float32(1 - 1 / focal_scale(self.profile, self.hidden, time_s, radius_px))
             x = x + shrinking * _part(self.x_rate, rows, columns)
             y = y + shrinking * _part(self.y_rate, rows, columns)
-        if len(self.filter_s):
-            pitch, yaw = (np.interp(time_s, self.filter_s, self.filter_rad[:, i]) for i in (0, 1))
-            fraction = self.profile.extensions.stabilisation_fraction
-            x, y = x - np.float32(fraction * yaw), y + np.float32(fraction * pitch)
+        if len(self.lens_s):
+            pitch, yaw = (np.interp(time_s, self.lens_s, self.lens_rad[:, i]) for i in (0, 1))
+            x, y = x - np.float32(yaw), y + np.float32(pitch)
         return x, y
 
 
@@ -78,12 +77,14 @@ def make_view(
     if focal_changes(profile, hidden):
         x_rate, y_rate = _focal_rate(lens)
         x, y = (np.broadcast_to(a, (lens.height, lens.width)) for a in (x, y))
-    filter_s, filter_rad = np.empty(0), np.empty((0, 2))
-    if profile.extensions.stabilisation_fraction:
-        filter_s, filter_rad = high_passed_angles(
-            motion, profile.extensions.stabilisation_cutoff_hz, motion.start_s if rest_s is None else rest_s
+    lens_s, lens_rad, held = np.empty(0), np.empty((0, 2)), profile.extensions
+    if held.stabilisation_fraction:
+        lens_s, angles = high_passed_angles(
+            motion, held.stabilisation_cutoff_hz, motion.start_s if rest_s is None else rest_s
         )
-    return View(profile, x, y, x_rate, y_rate, filter_s, filter_rad, hidden)
+        end = np.inf if held.stabilisation_travel_rad is None else held.stabilisation_travel_rad
+        lens_rad = np.clip(held.stabilisation_fraction * angles, -end, end)
+    return View(profile, x, y, x_rate, y_rate, lens_s, lens_rad, hidden)
 
 
 def start_fractions(direction: str, width: int, height: int) -> Array:

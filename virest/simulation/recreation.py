@@ -236,9 +236,9 @@ def _pixels(view: View, rays: Array, time_s: float) -> Array:
     profile, lens = view.profile, view.profile.intrinsics
     assert lens is not None
     plane = rays[..., :2] / rays[..., 2:]
-    if len(view.filter_s):
-        pitch, yaw = (np.interp(time_s, view.filter_s, view.filter_rad[:, i]) for i in (0, 1))
-        plane = plane + profile.extensions.stabilisation_fraction * np.array([yaw, -pitch])
+    if len(view.lens_s):
+        pitch, yaw = (np.interp(time_s, view.lens_s, view.lens_rad[:, i]) for i in (0, 1))
+        plane = plane + np.array([yaw, -pitch])
     pixels = lens.project(np.concatenate([plane, np.ones_like(plane[..., :1])], -1))
     if not focal_changes(profile, view.hidden):
         return pixels
