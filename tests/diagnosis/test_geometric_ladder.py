@@ -119,6 +119,29 @@ def test_a_wrong_readout_direction_is_named() -> None:
     assert verdict.model.profile.shutter == truth.shutter
 
 
+@pytest.mark.parametrize("travel_rad", [0.015, None])
+def test_a_stabiliser_is_named_with_its_travel_if_it_reaches_an_end(
+    travel_rad: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fraction, cutoff and travel hold; a lens that reaches no end has no travel."""
+    alike = ("stabilisation", "time_offset", "gyro_scale", "focal_length", "gyro_bias")
+    monkeypatch.setattr(candidates, "GEOMETRIC_EFFECTS", tuple(EFFECT[name] for name in alike))
+    setup = replace(HAND, seed=90, stabilised=(0.9, 0.4), travel_rad=travel_rad)
+    truth = recorded(setup).profile
+    verdict, found = climbed(setup, truth.with_extensions(stabilisation_fraction=0.0, stabilisation_travel_rad=None))
+    assert [finding.name for finding in found] == ["stabilisation"]
+    assert_explained(verdict, HAND.noise_px)
+    parameters = found[0].parameters
+    assert_holds(parameters["fraction"], 0.0, 0.9)
+    assert parameters["cutoff_hz"].estimate == pytest.approx(0.4, abs=4 * parameters["cutoff_hz"].std)
+    assert ("travel_rad" in parameters) == (", up to " in found[0].sentence) == (travel_rad is not None)
+    if travel_rad is not None:
+        travel = parameters["travel_rad"]
+        assert travel.nominal is None
+        assert travel.estimate == pytest.approx(travel_rad, abs=4 * travel.std)
+        assert travel.std < 0.02 * travel_rad
+
+
 @pytest.mark.parametrize(("seed", "scale", "as_pair"), [(81, 1.12, True), (82, 0.9, False)])
 def test_two_causes_that_hide_each_other_are_named_together(seed: int, scale: float, as_pair: bool) -> None:
     """A wrong gyroscope scale and a focal length that compensates for it are wrong only for roll.
