@@ -3,7 +3,8 @@
 ``focal_drift``: f(t) = f (1 + drift t) at every instant, t on the IMU's clock from stamp_0; fields of kind ``scale``
 add to the factor.  ``stabilisation``: the picture is shifted by f(t) · fraction · θ, with θ the camera's integrated
 rates about x and y through a continuous first-order high-pass from rest, θ' = ω − 2π cutoff θ.  The shift comes before
-the distortion: x += fraction θ_y, y −= fraction θ_x in units of the focal length; roll stays.
+the distortion: x += fraction θ_y, y −= fraction θ_x in units of the focal length, each between ± the travel where the
+lens has ends (the filter runs on beyond them); roll stays.
 """
 
 from __future__ import annotations
