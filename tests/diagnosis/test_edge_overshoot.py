@@ -73,6 +73,19 @@ def test_bright_lines_beside_edges_are_not_sharpening(rng):
     assert found(rng, seamed).p_value > MAX_P
 
 
+@pytest.mark.parametrize(("dark", "bright", "is_scene"), [(0.09, 0.5, True), (0.09, 0.09, False), (0.2, 0.08, False)])
+def test_edges_that_overshoot_more_on_the_bright_side_are_outlined(rng, dark, bright, is_scene):
+    """A curve leaves the dark side of a step steeper, so a mask overshoots more there; white window frames do not."""
+
+    def outlined(width):
+        line = np.exp(-0.5 * ((np.abs(GRID_PX) - 1.5) / 0.7) ** 2)
+        return ndtr(GRID_PX / width) + np.where(GRID_PX > 0, bright, -dark) * line
+
+    seen = found(rng, outlined)
+    assert seen.p_value < MAX_P
+    assert seen.is_scene is is_scene
+
+
 @pytest.mark.parametrize("texture", [0.1, 0.3])
 def test_texture_beside_edges_is_not_sharpening(texture):
     """Overshoot and undershoot are equally frequent; the steepest edges, which overshoot, do not represent all."""

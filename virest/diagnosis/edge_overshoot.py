@@ -5,6 +5,10 @@ keeps its range, so the mean of z(u) and 1 − z(−u) is fitted.  Where the ste
 amount · radius² is observable; the priors AMOUNT and RADIUS_PX then decide, and the standard deviations grow
 accordingly.
 
+A mask overshoots on the bright side by at most as much as on the dark one: light is blurred before a concave curve
+encodes it, which leaves the dark side of the step steeper.  What overshoots more on the bright side is the scene:
+window frames, printed outlines, polished rims.
+
 The significance test uses all isolated edges, whatever their width: if a textured surface happens to be brightest next
 to an edge, that edge overshoots and is therefore steeper, so the sharpest edges overshoot in any such scene.  The
 values of the mask come from the sharpest edges, since a soft step hardly overshoots.  A scene location that appears in
@@ -87,12 +91,24 @@ class Sharpening:
     amount_std: float
     radius_px: float
     radius_std_px: float
-    overshoot: float
-    """Overshoot of the sharpest edges, mean of both sides, as a fraction of the step."""
+    sides: tuple[float, float]
+    """Overshoot of the sharpest edges, dark and bright side, as a fraction of the step."""
+    brighter: float
+    """Excess of the bright side's over the dark side's, in σ: that of a mask is at most 0."""
     z: float
     """Excess overshoot of all edges over that of unsharpened movies, in σ, on the weaker side."""
     held_out: HeldOutGain
     """Residual rms of the mean profile, as a fraction of the step, without and with the mask."""
+
+    @property
+    def overshoot(self) -> float:
+        """Mean of both sides."""
+        return float(np.mean(self.sides))
+
+    @property
+    def is_scene(self) -> bool:
+        """Whether the bright side overshoots more than any mask explains."""
+        return EDGE_LEVELS.significant(student_tail(self.brighter, LOCATION_GROUPS - 1))
 
     @property
     def p_value(self) -> float:
@@ -121,6 +137,12 @@ def judge_sharpening(
     found = fit_sharpening(edge_profiles(seen, profile, trajectory)) if len(seen) else None
     if found is None:
         verdict.notes.append("too few sharp, isolated edges: sharpening was not tested")
+    elif found.is_scene:
+        dark, bright = found.sides
+        verdict.notes.append(
+            f"edges overshoot by {bright:.0%} on the bright side and {dark:.0%} on the dark one, which no unsharp mask "
+            "does: the scene's edges are outlined, and sharpening was not tested"
+        )
     elif EDGE_LEVELS.significant(found.p_value):
         values = {"amount": (found.amount, found.amount_std), "radius_px": (found.radius_px, found.radius_std_px)}
         known = EFFECTS["sharpening"].read(profile, profile)
@@ -159,7 +181,7 @@ def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
     numbers = np.unique(block)
     if len(profiles) < MIN_USED or len(numbers) < 4:
         return None
-    mean = np.median(profiles, axis=0)
+    mean, place = np.median(profiles, axis=0), edges.place[sharp]
     theta, covariance = _fit(_symmetrised(mean))
     without = [np.median(profiles[block != b], axis=0) for b in numbers]
     scatter = _jackknife([_fit(_symmetrised(one))[0] for one in without])
@@ -170,7 +192,8 @@ def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
         float(np.hypot(std[1], SIZE_ERROR * amount)),
         radius_px,
         radius_px * float(np.hypot(std[2], SIZE_ERROR)),
-        float(np.mean(_overshoots(mean))),
+        _overshoots(mean),
+        _brighter(profiles, place),
         _significance(edges),
         _held_out(profiles, block),
     )
@@ -178,11 +201,22 @@ def fit_sharpening(edges: EdgeProfiles) -> Sharpening | None:
 
 def _significance(edges: EdgeProfiles) -> float:
     """Excess overshoot of all edges over that of unsharpened movies, in σ, on the weaker side."""
-    group = np.unique(edges.place, return_inverse=True)[1] % LOCATION_GROUPS
-    sides = _overshoots(np.median(edges.profile, axis=0))
-    without = [_overshoots(np.median(edges.profile[group != g], axis=0)) for g in range(LOCATION_GROUPS)]
-    std = np.sqrt(np.diag(_jackknife(without)) + UNSHARPENED_STD**2)
-    return float(((sides - UNSHARPENED_OVERSHOOT) / std).min())
+    sides, covariance = _sides(edges.profile, edges.place)
+    return float(((sides - UNSHARPENED_OVERSHOOT) / np.sqrt(np.diag(covariance) + UNSHARPENED_STD**2)).min())
+
+
+def _brighter(profiles: Array, place: Index) -> float:
+    """Excess of the bright side's overshoot over the dark side's, in σ."""
+    sides, covariance = _sides(profiles, place)
+    variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1] + 2 * SELECTED_STD**2
+    return float((sides[1] - sides[0]) / np.sqrt(variance))
+
+
+def _sides(profiles: Array, place: Index) -> tuple[Array, Array]:
+    """Overshoots (2,) of the median profile and their covariance, by location groups."""
+    group = np.unique(place, return_inverse=True)[1] % LOCATION_GROUPS
+    without = [_overshoots(np.median(profiles[group != g], axis=0)) for g in range(LOCATION_GROUPS)]
+    return np.array(_overshoots(np.median(profiles, axis=0))), _jackknife(without)
 
 
 def sharpened_step(width_px: float, amount: float, radius_px: float) -> Array:
@@ -209,9 +243,9 @@ def _symmetrised(mean: Array) -> Array:
     return np.asarray(0.5 * (mean + 1.0 - mean[::-1]))
 
 
-def _overshoots(mean: Array) -> Array:
-    """(2,) below the dark plateau and above the bright one."""
-    return np.array([-mean[GRID_PX < 0].min(), mean[GRID_PX > 0].max() - 1.0])
+def _overshoots(mean: Array) -> tuple[float, float]:
+    """Below the dark plateau and above the bright one."""
+    return float(-mean[GRID_PX < 0].min()), float(mean[GRID_PX > 0].max() - 1.0)
 
 
 def _fit(mean: Array) -> tuple[Array, Array]:
@@ -230,9 +264,10 @@ def _covariance_of_unsharpened(mean: Array, theta: Array) -> Array:
     return moved
 
 
-def _jackknife(values: Sequence[Array]) -> Array:
+def _jackknife(values: Sequence[Array | tuple[float, ...]]) -> Array:
     """Jackknife covariance of an estimate from its leave-one-block-out values."""
-    away = np.stack(values) - np.mean(values, axis=0)
+    away = np.array(values, float)
+    away -= away.mean(axis=0)
     return np.asarray(away.T @ away * (len(values) - 1) / len(values))
 
 
