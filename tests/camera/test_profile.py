@@ -53,7 +53,7 @@ scene: {depth_m: null}                       # null: triangulate; inf: rotation 
 estimates: {}                                # NAME: {value, std, source}
 extensions:                                  # what a diagnosis added; an absent one is off (§4)
   focal_drift: {focal_drift_per_s: 0.0}
-  stabilisation: {fraction: 0.0, cutoff_hz: 1.0, travel_rad: null}
+  stabilisation: {fraction: 0.0, cutoff_hz: 1.0, travel_rad: null, at_end: runs_on}
   frame_lag: {lag_s: 0.0, frames: 0}
   exposures_late_frames: 0
   exposure_gain: []

@@ -11,7 +11,7 @@ import pytest
 from motion.synthetic_tracks import Recording, Setup
 
 from virest.camera.gyro_filter import delay_s
-from virest.camera.profile import CameraProfile
+from virest.camera.profile import CameraProfile, Extensions
 from virest.diagnosis import candidates
 from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
 from virest.diagnosis.cross_validation import Judged, judge, screen
@@ -119,22 +119,23 @@ def test_a_wrong_readout_direction_is_named() -> None:
     assert verdict.model.profile.shutter == truth.shutter
 
 
-@pytest.mark.parametrize("travel_rad", [0.015, None])
+@pytest.mark.parametrize(("travel_rad", "at_end"), [(0.015, "runs_on"), (0.012, "stops"), (None, "runs_on")])
 def test_a_stabiliser_is_named_with_its_travel_if_it_reaches_an_end(
-    travel_rad: float | None, monkeypatch: pytest.MonkeyPatch
+    travel_rad: float | None, at_end: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Fraction, cutoff and travel hold; a lens that reaches no end has no travel."""
     alike = ("stabilisation", "time_offset", "gyro_scale", "focal_length", "gyro_bias")
     monkeypatch.setattr(candidates, "GEOMETRIC_EFFECTS", tuple(EFFECT[name] for name in alike))
-    setup = replace(HAND, seed=90, stabilised=(0.9, 0.4), travel_rad=travel_rad)
+    setup = replace(HAND, seed=90, stabilised=(0.9, 0.4), travel_rad=travel_rad, at_end=at_end)
     truth = recorded(setup).profile
-    verdict, found = climbed(setup, truth.with_extensions(stabilisation_fraction=0.0, stabilisation_travel_rad=None))
+    verdict, found = climbed(setup, replace(truth, extensions=Extensions()))
     assert [finding.name for finding in found] == ["stabilisation"]
     assert_explained(verdict, HAND.noise_px)
     parameters = found[0].parameters
     assert_holds(parameters["fraction"], 0.0, 0.9)
     assert parameters["cutoff_hz"].estimate == pytest.approx(0.4, abs=4 * parameters["cutoff_hz"].std)
     assert ("travel_rad" in parameters) == (", up to " in found[0].sentence) == (travel_rad is not None)
+    assert verdict.model.profile.extensions.stabilisation_at_end == at_end
     if travel_rad is not None:
         travel = parameters["travel_rad"]
         assert travel.nominal is None

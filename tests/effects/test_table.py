@@ -78,6 +78,7 @@ OTHER_EXTENSION: dict[str, Any] = {
     "stabilisation_fraction": 0.7,
     "stabilisation_cutoff_hz": 1.4,
     "stabilisation_travel_rad": 0.005,
+    "stabilisation_at_end": "stops",
     "stabilisation_lean_rad": (0.01, -0.02),
     "frame_lag_s": 0.1,
     "frame_lag_frames": 3,

@@ -62,6 +62,7 @@ class Setup:
     """Fraction and cutoff in Hz of the lens's stabiliser."""
     travel_rad: float | None = None
     """Its largest shift; None: no ends."""
+    at_end: str = "runs_on"
     time_offset_s: float = 0.013
     clock_skew: float = 0.0
     gyro_bias_rad_s: Triple = (0.004, -0.006, 0.003)
@@ -216,6 +217,7 @@ class Recording:
                 *s.stabilised,
                 gyro_lowpass_hz=s.gyro_lowpass_hz,
                 stabilisation_travel_rad=s.travel_rad,
+                stabilisation_at_end=s.at_end,
             ),
         )
 
@@ -298,8 +300,15 @@ class Recording:
         fraction, cutoff_hz = self.setup.stabilised
         time_s = np.arange(self.imu.time_s[0], self.imu.time_s[-1], 2e-4)
         decay = np.exp(-2 * np.pi * cutoff_hz * 2e-4)
-        theta = lfilter([2e-4 * np.sqrt(decay)], [1.0, -decay], self.rate(time_s + 1e-4), axis=0)
         end = np.inf if self.setup.travel_rad is None else self.setup.travel_rad
+        if self.setup.at_end == "stops":
+            theta, at = [], np.zeros(3)
+            for rate in self.rate(time_s + 1e-4):
+                at = np.clip(decay * at + 2e-4 * np.sqrt(decay) * rate, -end / fraction, end / fraction)
+                theta.append(at)
+            theta = np.array(theta)
+        else:
+            theta = lfilter([2e-4 * np.sqrt(decay)], [1.0, -decay], self.rate(time_s + 1e-4), axis=0)
         return time_s + 2e-4, np.clip(fraction * theta[:, [1, 0]] * (1.0, -1.0), -end, end)
 
     @property

@@ -71,6 +71,21 @@ def test_the_shift_solves_the_high_pass() -> None:
     np.testing.assert_allclose(stabiliser_shift(time_s, rate, -0.8, 1.7), expected, atol=1e-10)
 
 
+def test_a_filter_that_stops_at_the_end_turns_back_at_once() -> None:
+    """θ is limited at every step, from any lean; a filter that runs on comes back late."""
+    rng = np.random.default_rng(9)
+    time_s = np.cumsum(rng.uniform(0.001, 0.02, 300))
+    rate = np.cumsum(0.3 * rng.normal(size=(300, 3)), axis=0)
+    free, lean = stabiliser_shift(time_s, rate, 0.8, 0.4), np.array([0.03, -0.02])
+    stopped = stabiliser_shift(time_s, rate, 0.8, 0.4, lean, travel_rad=0.02)
+    theta, end = lean[None].clip(-0.025, 0.025), 0.025
+    for k, (a, b) in enumerate(pairwise(time_s)):
+        step = stabiliser_shift(np.array([a, b]), rate[k : k + 2], 1.0, 0.4)[1]
+        theta = np.vstack([theta, np.clip(np.exp(-0.8 * np.pi * (b - a)) * theta[-1] + [-step[1], step[0]], -end, end)])
+    np.testing.assert_allclose(stopped, 0.8 * theta[:, [1, 0]] * (1.0, -1.0), atol=1e-12)
+    assert np.abs(np.clip(free, -0.02, 0.02) - stopped).max() > 0.01
+
+
 def test_a_cutoff_near_zero_keeps_the_complete_rotation() -> None:
     """Without the high-pass filter the shift is the plain integral of the rate."""
     time_s = np.linspace(0, 1, 11)
@@ -141,9 +156,9 @@ def test_projection_inverts_rays_at_every_time(lens: tuple[str, tuple[float, ...
     np.testing.assert_array_equal(cut.rays(pixels(), time_s), moving.rays(pixels(), time_s))
 
 
-@pytest.mark.parametrize("travel_rad", [None, 0.02])
+@pytest.mark.parametrize(("travel_rad", "at_end"), [(None, "runs_on"), (0.02, "runs_on"), (0.02, "stops")])
 @pytest.mark.parametrize("lens", LENSES)
-def test_rays_match_the_simulator(lens: tuple[str, tuple[float, ...]], travel_rad: float | None) -> None:
+def test_rays_match_the_simulator(lens: tuple[str, tuple[float, ...]], travel_rad: float | None, at_end: str) -> None:
     """Drift and stabiliser apply in the simulator's order: shift before distortion, drift of the complete frame."""
     profile = extended(
         phone(lens=lens, time_offset_s=0.0),
@@ -151,6 +166,7 @@ def test_rays_match_the_simulator(lens: tuple[str, tuple[float, ...]], travel_ra
         stabilisation_fraction=0.7,
         stabilisation_cutoff_hz=0.8,
         stabilisation_travel_rad=travel_rad,
+        stabilisation_at_end=at_end,
     )
     moving = moving_lens(sampled(HAND, profile, -0.6, 1.0), profile)
     view = make_view(profile, HAND, rest_s=-0.6)

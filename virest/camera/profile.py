@@ -39,6 +39,11 @@ class Estimate:
     source: str
 
 
+RUNS_ON, STOPS = STABILISERS_AT_END = ("runs_on", "stops")
+"""At the end of its travel a lens waits until the filter, which runs on, has come back; or the filter stops too, and
+the lens follows as soon as the camera turns back."""
+
+
 @dataclass(frozen=True, slots=True)
 class Extensions:
     """Effects that a diagnosis added to the nominal model (contract, section 4); off by default."""
@@ -66,6 +71,8 @@ class Extensions:
     """Factors on the logged exposure times of frames, by movie index; 1 where the list has none."""
     stabilisation_travel_rad: float | None = None
     """Largest shift of the lens along each axis, as an angle; None: it never reaches an end."""
+    stabilisation_at_end: str = RUNS_ON
+    """Whether the stabiliser's filter runs on beyond the ends, or stops there."""
     stabilisation_lean_rad: tuple[float, float] = (0.0, 0.0)
     """θ about x and y at the start of the inertial log; fitted but not stored in files: its effect decays soon."""
     field: tuple[ModelField, ...] = ()

@@ -86,6 +86,7 @@ def _from_model(model: ProfileFile) -> CameraProfile:
             stabilisation_fraction=extensions.stabilisation.fraction,
             stabilisation_cutoff_hz=extensions.stabilisation.cutoff_hz,
             stabilisation_travel_rad=extensions.stabilisation.travel_rad,
+            stabilisation_at_end=extensions.stabilisation.at_end,
             frame_lag_s=extensions.frame_lag.lag_s,
             frame_lag_frames=extensions.frame_lag.frames,
             exposures_late_frames=extensions.exposures_late_frames,
@@ -217,6 +218,7 @@ def profile_mapping(profile: CameraProfile) -> dict[str, Any]:
         }
         if ext.stabilisation_travel_rad is not None:
             extensions["stabilisation"]["travel_rad"] = ext.stabilisation_travel_rad
+            extensions["stabilisation"]["at_end"] = ext.stabilisation_at_end
     if ext.frame_lag_frames:
         extensions["frame_lag"] = {"lag_s": ext.frame_lag_s, "frames": ext.frame_lag_frames}
     if ext.exposures_late_frames:

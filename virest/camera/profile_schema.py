@@ -145,6 +145,7 @@ class _Stabilisation(_Strict):
     fraction: Annotated[Number, Field(ge=-2, le=2)] = 0.0
     cutoff_hz: Positive = 1.0
     travel_rad: Positive | None = None
+    at_end: Literal["runs_on", "stops"] = "runs_on"
 
 
 class _FrameLag(_Strict):

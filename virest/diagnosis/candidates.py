@@ -15,7 +15,7 @@ from virest.effects.table import is_sought
 from virest.image_formation.point_model import TrackTable, integrate_motion, predict
 from virest.inference.profile_terms import STABILISATION
 from virest.inference.recorder_lag import Schedule
-from virest.inference.stabiliser_start import stabiliser_starts
+from virest.inference.stabiliser_fit import stabiliser_starts
 from virest.inference.track_fit import Term
 from virest.motion.scene_motion import InertialMotion
 
@@ -109,8 +109,7 @@ def candidates_of(
         if effect.term is None:
             found += _word_candidates(effect, model)
             continue
-        for values in (None, *_starts(evidence, model, effect)):
-            profile = model.profile if values is None else effect.term.change(model.profile, values)
+        for profile in (model.profile, *_starts(evidence, model, effect, effect.term)):
             found.append(Candidate(effect.name, replace(model, profile=profile), (effect.term,), effect))
         far_start = far.start(effect.name, nominal, model.profile, "time_offset" in in_terms)
         if far_start is not None:
@@ -126,10 +125,10 @@ def candidates_of(
     return found
 
 
-def _starts(evidence: Evidence, model: Model, effect: GeometricEffect) -> Array:
-    """Starting changes (n, k) of an effect's values, besides 0."""
-    if effect.term is not STABILISATION:
-        return np.array(effect.starts)
+def _starts(evidence: Evidence, model: Model, effect: GeometricEffect, term: Term) -> list[CameraProfile]:
+    """Profiles at which fits of an effect begin, besides the model's."""
+    if term is not STABILISATION:
+        return [term.change(model.profile, np.array(values)) for values in effect.starts]
     return stabiliser_starts(evidence.start(model, SCREEN_POINTS, lambda: evidence.table(model, SCREEN_POINTS)))
 
 

@@ -17,6 +17,7 @@ from virest.diagnosis.selection import POINT_LEVELS, WORD_LEVELS
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import right_way_round
 from virest.inference.chance import chance_of, chi2_tail
+from virest.inference.stabiliser_fit import without_idle_ends
 from virest.inference.track_fit import TrackFit
 from virest.inference.tracking_bias import bias_std
 
@@ -32,8 +33,11 @@ def refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, Trac
 
 
 def fitted_with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
-    """Refit the model with the candidate added."""
-    return refitted(evidence, replace(candidate.model, terms=(*candidate.model.terms, *candidate.added)), JUDGE_POINTS)
+    """Refit the model with the candidate added; a stabiliser without ends, if its lens does not reach them."""
+    model = replace(candidate.model, terms=(*candidate.model.terms, *candidate.added))
+    found, fitted = refitted(evidence, model, JUDGE_POINTS)
+    endless = without_idle_ends(fitted)
+    return (found, fitted) if endless is None else refitted(evidence, replace(found, profile=endless), JUDGE_POINTS)
 
 
 def significant(

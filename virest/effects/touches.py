@@ -41,7 +41,7 @@ OF_PROFILE = {
 OF_EXTENSIONS = {
     **dict.fromkeys(("gyro_lowpass_hz", "gyro_averaging_s", "gyro_misalignment_rad"), RATES),
     **dict.fromkeys(("focal_drift_per_s", "stabilisation_fraction", "stabilisation_cutoff_hz"), LENS),
-    **dict.fromkeys(("stabilisation_travel_rad", "stabilisation_lean_rad"), LENS),
+    **dict.fromkeys(("stabilisation_travel_rad", "stabilisation_at_end", "stabilisation_lean_rad"), LENS),
     **dict.fromkeys(("frame_lag_s", "frame_lag_frames"), NOTHING),
     **dict.fromkeys(("exposures_late_frames", "exposure_gain"), NOTHING),
     **dict.fromkeys(("vignetting_corner_loss", "gain", "defocus_sigma_px"), NOTHING),

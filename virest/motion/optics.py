@@ -4,7 +4,7 @@
 add to the factor.  ``stabilisation``: the picture is shifted by f(t) · fraction · θ, with θ the camera's integrated
 rates about x and y through a continuous first-order high-pass from rest, θ' = ω − 2π cutoff θ.  The shift comes before
 the distortion: x += fraction θ_y, y −= fraction θ_x in units of the focal length, each between ± the travel where the
-lens has ends (the filter runs on beyond them); roll stays.
+lens has ends; roll stays.  There the filter runs on, or it stops, so that fraction θ stays between them too.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ import numpy as np
 from virest.arrays import Array
 from virest.camera.field import Field
 from virest.camera.intrinsics import Intrinsics
-from virest.camera.profile import CameraProfile
+from virest.camera.profile import STOPS, CameraProfile
 from virest.motion.trajectory import Trajectory
 
 SHIFT_STEP_S = 5e-4
 """Step of the stabiliser's path: at 50 rad/s² linear interpolation errs by 1.6e-6 rad."""
+NO_END_RAD = 1e6
+"""Travel of a lens without ends: finite, so that a decay to 0 times it is 0."""
 SETTLED = 16.0
 """After this many time constants 1 / (2π cutoff) the high-pass filter's initial state has decayed to 1e-7."""
 RADIUS_STEPS = 5
@@ -142,16 +144,19 @@ def moving_lens(
         grid_s = _shift_grid(*trajectory.span_s, step_s)
         path = grid_s, trajectory.rate_rad_s(grid_s)
     time_s, fraction, cutoff_hz = path[0], extensions.stabilisation_fraction, extensions.stabilisation_cutoff_hz
+    travel_rad, lean_rad = extensions.stabilisation_travel_rad, np.array(extensions.stabilisation_lean_rad)
+    if travel_rad is not None and extensions.stabilisation_at_end == STOPS:
+        shift = stabiliser_shift(*path, fraction, cutoff_hz, lean_rad, travel_rad)
+        return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path, None, zoom)
     swing = None if like is None else like.swing
     if swing is None or swing[0] != cutoff_hz or like is None or like.path is not path:
         swing = cutoff_hz, stabiliser_shift(*path, 1.0, cutoff_hz)
     shift = fraction * swing[1]
-    if any(extensions.stabilisation_lean_rad):
-        about_x, about_y = extensions.stabilisation_lean_rad
+    if lean_rad.any():
         forgotten = np.exp(-2 * np.pi * cutoff_hz * (time_s - time_s[0]))
-        shift = shift + fraction * forgotten[:, None] * np.array([about_y, -about_x])
-    if extensions.stabilisation_travel_rad is not None:
-        shift = np.clip(shift, -extensions.stabilisation_travel_rad, extensions.stabilisation_travel_rad)
+        shift = shift + fraction * forgotten[:, None] * np.array([lean_rad[1], -lean_rad[0]])
+    if travel_rad is not None:
+        shift = np.clip(shift, -travel_rad, travel_rad)
     return MovingLens(profile.intrinsics, extensions.focal_drift_per_s, time_s, shift, path, swing, zoom)
 
 
@@ -177,17 +182,26 @@ def settling_time_s(profile: CameraProfile) -> float:
     return SETTLED / (2 * np.pi * max(extensions.stabilisation_cutoff_hz, 1e-9))
 
 
-def stabiliser_shift(time_s: Array, rate_cam_rad_s: Array, fraction: float, cutoff_hz: float) -> Array:
-    """Shift (n, 2) in units of the focal length: x += fraction θ_y, y −= fraction θ_x, at rest at the first time.
+def stabiliser_shift(
+    time_s: Array,
+    rate_cam_rad_s: Array,
+    fraction: float,
+    cutoff_hz: float,
+    lean_rad: Array | tuple[float, float] = (0.0, 0.0),
+    travel_rad: float = NO_END_RAD,
+) -> Array:
+    """Shift (n, 2) in units of the focal length: x += fraction θ_y, y −= fraction θ_x.
 
-    θ' = ω − 2π cutoff θ, solved exactly for a rate (n, 3), camera axes, that is linear between the times (n,).
+    θ' = ω − 2π cutoff θ, solved exactly for a rate (n, 3), camera axes, that is linear between the times (n,); the
+    filter stops where fraction θ reaches ± travel_rad.  lean_rad: θ at the first time.
     """
     step_s = np.diff(time_s)
     decayed = 2 * np.pi * cutoff_hz * step_s
     mean, ramp = _exponential_means(decayed)
     rate = rate_cam_rad_s[:, :2]
     drive = step_s[:, None] * ((mean - ramp)[:, None] * rate[:-1] + ramp[:, None] * rate[1:])
-    theta = _running_response(np.exp(-decayed), drive)
+    end = travel_rad / max(abs(fraction), _SMALL)
+    theta = _running_response(np.exp(-decayed), drive, np.clip(lean_rad, -end, end), end)
     return fraction * np.stack([theta[:, 1], -theta[:, 0]], axis=-1)
 
 
@@ -199,17 +213,29 @@ def _exponential_means(x: Array) -> tuple[Array, Array]:
     return mean, ramp
 
 
-def _running_response(decay: Array, drive: Array) -> Array:
-    """θ[0] = 0, θ[k + 1] = decay[k] θ[k] + drive[k]. Returns (n + 1, 2)."""
-    return np.concatenate([np.zeros((1, drive.shape[1])), _responses(decay[:, None], drive)])
+def _running_response(decay: Array, drive: Array, start: Array, end: float) -> Array:
+    """θ[0] = start, θ[k + 1] = decay[k] θ[k] + drive[k], between ± end. Returns (n + 1, 2)."""
+    drive = drive.copy()
+    drive[:1] += decay[:1, None] * start
+    ends = np.full_like(drive, end)
+    return np.concatenate([start[None], _responses(decay[:, None], drive, -ends, ends)])
 
 
-def _responses(decay: Array, drive: Array) -> Array:
-    """θ[1:], recursively: two steps combine into one with both decays. log2(n) vectorised passes, 2 n steps in all."""
+def _responses(decay: Array, drive: Array, low: Array, high: Array) -> Array:
+    """θ[1:], recursively: two steps θ → clip(decay θ + drive, low, high) combine into one of the same form.
+
+    log2(n) vectorised passes, 2 n steps in all.
+    """
     if len(drive) < 2:
-        return drive
+        return np.clip(drive, low, high)
     found = np.empty_like(drive)
-    found[0] = drive[0]
-    found[1::2] = _responses(decay[:-1:2] * decay[1::2], decay[1::2] * drive[:-1:2] + drive[1::2])
-    found[2::2] = decay[2::2] * found[1:-1:2] + drive[2::2]
+    found[0] = np.clip(drive[0], low[0], high[0])
+    second = decay[1::2], drive[1::2], low[1::2], high[1::2]
+    both = (_step(part[:-1:2], *second) for part in (low, high))
+    found[1::2] = _responses(decay[:-1:2] * second[0], second[0] * drive[:-1:2] + second[1], *both)
+    found[2::2] = _step(found[1:-1:2], decay[2::2], drive[2::2], low[2::2], high[2::2])
     return found
+
+
+def _step(theta: Array, decay: Array, drive: Array, low: Array, high: Array) -> Array:
+    return np.clip(decay * theta + drive, low, high)

@@ -13,7 +13,7 @@ from virest.effects.changes import k1_of, k2_of, mean_gyro_scale
 from virest.effects.table import GYRO_SCALE_OFF
 from virest.inference import profile_terms as terms_of
 from virest.inference.fit_start import FitStart
-from virest.inference.stabiliser_start import stabiliser_starts
+from virest.inference.stabiliser_fit import stabiliser_starts
 from virest.inference.track_fit import Term
 
 SOURCE = "tracked points against the gyroscope, which contradict the profile's value"
@@ -37,14 +37,17 @@ HIGHEST_CUTOFF_HZ = 15.0
 in 10 s acts like one that never does."""
 
 
+Starts = Callable[[FitStart], list[CameraProfile]]
+"""Profiles at which fits of a cause begin, from one without it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Cause:
     """One possible profile error."""
 
     name: str
     term: Term
-    starts: Callable[[FitStart], Array]
-    """(n, k) changes of the term's values, as starting points for a fit."""
+    starts: Starts
     plausible: Callable[[CameraProfile, CameraProfile], bool]
     """Whether a phone can have such a value.  Arguments: given profile, fitted one."""
     change: Callable[[CameraProfile, CameraProfile], float]
@@ -56,14 +59,15 @@ class Cause:
     """Message about the adopted value.  Arguments: given profile, fitted one, standard deviations (k,)."""
 
 
-def _skews(start: FitStart) -> Array:
+def _by_steps(term: Term, steps: Array) -> Starts:
+    """Starts that change a term by each of the steps (n,)."""
+    return lambda start: [term.change(start.profile, step) for step in steps[:, None]]
+
+
+def _skews(start: FitStart) -> list[CameraProfile]:
     span_s = max(float(np.abs(start.table.second_stamp_s).max()), 0.1)
     count = min(2 * int(np.ceil(SKEW_REACH * span_s / (2 * SKEW_ERROR_S))) + 1, MOST_SKEWS)
-    return np.linspace(-SKEW_REACH, SKEW_REACH, max(count, 5))[:, None]
-
-
-def _focal_scales(_: FitStart) -> Array:
-    return np.linspace(-FOCAL_REACH, FOCAL_REACH, FOCAL_STEPS)[:, None]
+    return _by_steps(terms_of.CLOCK_SKEW, np.linspace(-SKEW_REACH, SKEW_REACH, max(count, 5)))(start)
 
 
 def _focal_px(profile: CameraProfile) -> float:
@@ -91,6 +95,7 @@ def _with_stabiliser(profile: CameraProfile, found: CameraProfile, std: Array) -
         stabilisation_cutoff_hz=cutoff_hz,
         stabilisation_lean_rad=ext.stabilisation_lean_rad,
         stabilisation_travel_rad=ext.stabilisation_travel_rad,
+        stabilisation_at_end=ext.stabilisation_at_end,
     )
     taken = profile.with_estimate("stabilisation_fraction", fraction, float(std[0]), SOURCE, extensions=extensions)
     taken = taken.with_estimate("stabilisation_cutoff_hz", cutoff_hz, cutoff_hz * float(std[1]), SOURCE)
@@ -108,10 +113,6 @@ def _stabiliser_message(given: CameraProfile, found: CameraProfile, std: Array) 
         f"stabiliser that cancels {cancelled} above {ext.stabilisation_cutoff_hz:.2g} Hz{ends} used instead of the "
         f"profile's {given.extensions.stabilisation_fraction:g}"
     )
-
-
-def _gyro_scales(_: FitStart) -> Array:
-    return np.linspace(-GYRO_REACH, GYRO_REACH, GYRO_STEPS)[:, None]
 
 
 def _gyro_ratio(given: CameraProfile, found: CameraProfile) -> float:
@@ -138,7 +139,7 @@ def _distortion(name: str, key: str, term: Term, steps: Array, read: Callable[[C
         return f"{told} used instead of the profile's {read(given):+g}"
 
     return Cause(
-        name, term, lambda _: steps[:, None], _is_lens, lambda given, found: read(found) - read(given), adopt, message
+        name, term, _by_steps(term, steps), _is_lens, lambda given, found: read(found) - read(given), adopt, message
     )
 
 
@@ -166,7 +167,7 @@ CAUSES = (
     Cause(
         FOCAL_LENGTH,
         replace(terms_of.FOCAL, prior_std=(0.6,)),
-        _focal_scales,
+        _by_steps(terms_of.FOCAL, np.linspace(-FOCAL_REACH, FOCAL_REACH, FOCAL_STEPS)),
         lambda given, found: 0.35 < _focal_px(found) / _focal_px(given) < 2.9,
         lambda given, found: float(np.log(_focal_px(found) / _focal_px(given))),
         _with_focal,
@@ -178,7 +179,7 @@ CAUSES = (
     Cause(
         GYROSCOPE,
         terms_of.GYRO_SCALE,
-        _gyro_scales,
+        _by_steps(terms_of.GYRO_SCALE, np.linspace(-GYRO_REACH, GYRO_REACH, GYRO_STEPS)),
         lambda given, found: abs(mean_gyro_scale(found) - 1) < GYRO_SCALE_OFF,
         lambda given, found: float(np.log(_gyro_ratio(given, found))),
         _with_gyro_scale,

@@ -34,6 +34,7 @@ from virest.inference.profile_terms import (
     shift_offset,
 )
 from virest.inference.robust import RAYLEIGH_MEDIAN
+from virest.inference.stabiliser_fit import without_idle_ends
 from virest.inference.time_blocks import even_blocks, halves
 from virest.inference.track_fit import Term, TrackFit, fit_tracks, many_directions, start_scene
 from virest.inference.tracking_bias import bias_std
@@ -70,7 +71,8 @@ MOST_BENT = 0.2
 BLOCKS = 8
 """Time blocks.  Student's t at HELD_OUT_P is then 1.89; with half as many blocks 2.35, with twice as many 1.75."""
 POINTS, START_POINTS, STARTS = 1500, 400, 2
-"""Number of points in a fit, and in the ranking of starting values; number of starting values that are fitted."""
+"""Number of points in a fit, and in the ranking of starting values; number of starting values that are fitted, each
+from the profile before or after the last fit, whichever is nearer."""
 TRANSLATION_GAIN = 0.9
 """Include camera translation if it reduces the residual below this fraction of that of rotation alone."""
 
@@ -305,21 +307,30 @@ class _Search:
 
     def _best(self, here: _Start, fit: TrackFit, cause: Cause) -> tuple[_Start, TrackFit] | None:
         """The cause's best fit from its best starts, on the profile as it stood before the last fit and after it."""
-        starts = [
-            cause.term.change(profile, step)
-            for profile in (here.profile, fit.profile)
-            for step in cause.starts(FitStart(self.imu, self.table, profile, here.scene))
+        ways = [
+            cause.starts(FitStart(self.imu, self.table, profile, here.scene)) for profile in (here.profile, fit.profile)
         ]
         if cause.term is CLOCK_SKEW:
-            middle_s = float(np.mean(self.table.second_stamp_s))
-            moved = [(profile.clock_skew - self.given.clock_skew) * middle_s for profile in starts]
-            starts += [shift_offset(p, np.array([-moved_s])) for p, moved_s in zip(starts, moved, strict=True)]
-        off = [self._typical_distance(profile, here.scene) for profile in starts]
+            ways += [[self._at_the_same_offset(profile) for profile in starts] for starts in ways]
+        off = np.array([[self._typical_distance(profile, here.scene) for profile in starts] for starts in ways])
         found = []
-        for number in np.argsort(off)[:STARTS]:
-            start = _Start(starts[int(number)], (*here.causes, cause), here.scene)
-            found.append((start, self.fit(start)))
+        for number in np.argsort(off.min(axis=0))[:STARTS]:
+            start = _Start(ways[off[:, number].argmin()][number], (*here.causes, cause), here.scene)
+            found.append(self._without_idle_ends(start, self.fit(start)))
         return min(found, key=lambda one: one[1].cost, default=None)
+
+    def _at_the_same_offset(self, profile: CameraProfile) -> CameraProfile:
+        """A profile with another clock skew, with the given profile's offset in the middle of the capture."""
+        middle_s = float(np.mean(self.table.second_stamp_s))
+        return shift_offset(profile, np.array([(self.given.clock_skew - profile.clock_skew) * middle_s]))
+
+    def _without_idle_ends(self, start: _Start, fit: TrackFit) -> tuple[_Start, TrackFit]:
+        """A fit with its start; both again without a stabiliser's ends, if its lens does not reach them."""
+        endless = without_idle_ends(fit)
+        if endless is None:
+            return start, fit
+        start = replace(start, profile=endless)
+        return start, self.fit(start)
 
     def _typical_distance(self, profile: CameraProfile, scene: Motion | None) -> float:
         """Median normalised distance of START_POINTS points from a profile's prediction."""

@@ -79,10 +79,11 @@ def make_view(
         x, y = (np.broadcast_to(a, (lens.height, lens.width)) for a in (x, y))
     lens_s, lens_rad, held = np.empty(0), np.empty((0, 2)), profile.extensions
     if held.stabilisation_fraction:
-        lens_s, angles = high_passed_angles(
-            motion, held.stabilisation_cutoff_hz, motion.start_s if rest_s is None else rest_s
-        )
         end = np.inf if held.stabilisation_travel_rad is None else held.stabilisation_travel_rad
+        stop = end / abs(held.stabilisation_fraction) if held.stabilisation_at_end == "stops" else np.inf
+        lens_s, angles = high_passed_angles(
+            motion, held.stabilisation_cutoff_hz, motion.start_s if rest_s is None else rest_s, stop
+        )
         lens_rad = np.clip(held.stabilisation_fraction * angles, -end, end)
     return View(profile, x, y, x_rate, y_rate, lens_s, lens_rad, hidden)
 
@@ -169,10 +170,13 @@ def pixel_rays(lens: Intrinsics) -> tuple[Image, Image]:
     return undistorted[0].astype(np.float32), undistorted[1].astype(np.float32)
 
 
-def high_passed_angles(motion: HandMotion, cutoff_hz: float, rest_s: float) -> tuple[Array, Array]:
+def high_passed_angles(
+    motion: HandMotion, cutoff_hz: float, rest_s: float, stop_rad: float = np.inf
+) -> tuple[Array, Array]:
     """High-pass the integrated rates about camera x and y, at rest at ``rest_s``: times (n,), angles (n, 2).
 
-    First-order filter ``θ' = ω − 2π cutoff θ``, solved exactly for a rate linear within each step.
+    First-order filter ``θ' = ω − 2π cutoff θ``, solved exactly for a rate linear within each step; it stops at
+    ± ``stop_rad``.
     """
     time_s = np.arange(rest_s, motion.end_s, FINE_STEP_S)
     rate = motion.rate_rad_s(time_s)[:, :2]
@@ -183,7 +187,7 @@ def high_passed_angles(motion: HandMotion, cutoff_hz: float, rest_s: float) -> t
     drive = (mean - ramp) * rate[:-1] + ramp * rate[1:]
     angle = np.zeros_like(rate)
     for i, step in enumerate(drive):
-        angle[i + 1] = decay * angle[i] + step
+        angle[i + 1] = np.clip(decay * angle[i] + step, -stop_rad, stop_rad)
     return time_s, angle
 
 
