@@ -39,7 +39,7 @@ GRID_S = 4e-3
 
 
 def stabiliser_starts(start: FitStart) -> list[CameraProfile]:
-    """The start's profile with the best stabiliser without ends, and with ends, where its filter runs on or stops.
+    """The start's profile with the best stabiliser without ends, with ends where its filter runs on, and stops.
 
     Judged by the points' median distance from the prediction; of a motion with unknown directions only the rotation is
     predicted.
@@ -67,9 +67,8 @@ def stabiliser_starts(start: FitStart) -> list[CameraProfile]:
             travels_rad = FRACTIONS.ravel() * stop_rad
             stopping.append(_best(left, FRACTIONS * swing(cutoff_hz, stop_rad), cutoff_hz, travels_rad))
     found = []
-    runs_on, stops = min(limited), min(stopping)
-    best = (runs_on, RUNS_ON) if runs_on < stops else (stops, STOPS)
-    for (_, fraction, cutoff_hz, travel_rad), at_end in ((min(endless), RUNS_ON), best):
+    for judged, at_end in ((endless, RUNS_ON), (limited, RUNS_ON), (stopping, STOPS)):
+        _, fraction, cutoff_hz, travel_rad = min(judged)
         found.append(
             start.profile.with_extensions(
                 stabilisation_fraction=fraction,
