@@ -87,9 +87,7 @@ def without_idle_ends(fit: TrackFit) -> CameraProfile | None:
     travel_rad = profile.extensions.stabilisation_travel_rad
     if travel_rad is None or term not in fit.slices:
         return None
-    endless = profile.with_extensions(
-        stabilisation_travel_rad=None, stabilisation_at_end=RUNS_ON, stabilisation_lean_rad=(0.0, 0.0)
-    )
+    endless = profile.with_extensions(stabilisation_travel_rad=None, stabilisation_lean_rad=(0.0, 0.0))
     shift = moving_lens(fit.integrated.trajectory, endless).shift_at(fit.seconds)
     beyond = float(np.abs(shift).max()) - travel_rad
     std = fit.std(term)[INVERSE_TRAVEL] * travel_rad**2
