@@ -39,7 +39,7 @@ class Estimate:
     source: str
 
 
-RUNS_ON, STOPS = STABILISERS_AT_END = ("runs_on", "stops")
+RUNS_ON, STOPS = "runs_on", "stops"
 """At the end of its travel a lens waits until the filter, which runs on, has come back; or the filter stops too, and
 the lens follows as soon as the camera turns back."""
 
