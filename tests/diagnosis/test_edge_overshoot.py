@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 from scipy.special import ndtr
 
 from virest.app.diagnose import Source, open_source
@@ -71,6 +72,19 @@ def test_bright_lines_beside_edges_are_not_sharpening(rng):
         return ndtr(GRID_PX / width) + 0.12 * np.exp(-0.5 * ((GRID_PX - 2.0) / 0.8) ** 2)
 
     assert found(rng, seamed).p_value > MAX_P
+
+
+@pytest.mark.parametrize("darkest", [0.005, 0.02, 0.1, 0.3, 0.6])
+@pytest.mark.parametrize("width", [0.4, 0.8, 2.0])
+@pytest.mark.parametrize("radius_px", [0.8, 1.2, 3.0])
+def test_a_mask_overshoots_no_more_on_the_bright_side(darkest, width, radius_px):
+    """A step in light, blurred, encoded by sRGB's curve and sharpened: less above the bright plateau than below."""
+    u = np.arange(-30.0, 30.0, 0.05)
+    light = darkest + (1 - darkest) * ndtr(u / width)
+    grey = np.where(light < 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    grey = (grey - grey[0]) / (grey[-1] - grey[0])
+    sharpened = grey + 0.7 * (grey - gaussian_filter1d(grey, radius_px / 0.05))
+    assert 0 < sharpened.max() - 1 < -sharpened.min()
 
 
 @pytest.mark.parametrize(("dark", "bright", "is_scene"), [(0.09, 0.5, True), (0.09, 0.09, False), (0.2, 0.08, False)])

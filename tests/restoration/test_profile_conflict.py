@@ -92,15 +92,18 @@ def test_an_unlisted_stabiliser_is_found(fraction: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("travel_rad", "cutoff_hz", "at_end"), [(0.012, 0.5, "runs_on"), (0.02, 0.3, "runs_on"), (0.013, 0.4, "stops")]
+    ("fraction", "travel_rad", "cutoff_hz", "at_end"),
+    [(0.9, 0.012, 0.5, "runs_on"), (1.0, 0.02, 0.3, "runs_on"), (0.9, 0.013, 0.4, "stops")],
 )
-def test_a_stabiliser_at_the_end_of_its_travel_is_found(travel_rad: float, cutoff_hz: float, at_end: str) -> None:
+def test_a_stabiliser_at_the_end_of_its_travel_is_found(
+    fraction: float, travel_rad: float, cutoff_hz: float, at_end: str
+) -> None:
     """The lens rests at an end for part of the time; one without ends explains little of the motion."""
-    recording = recorded(replace(HAND, stabilised=(0.9, cutoff_hz), travel_rad=travel_rad, at_end=at_end))
+    recording = recorded(replace(HAND, stabilised=(fraction, cutoff_hz), travel_rad=travel_rad, at_end=at_end))
     assert 0.1 < np.isclose(np.abs(recording._shift[1]), travel_rad).mean() < 0.9
     found = settled(recording, replace(recording.profile, extensions=Extensions()))
     ext = found.profile.extensions
-    assert ext.stabilisation_fraction == pytest.approx(0.9, abs=0.03)
+    assert ext.stabilisation_fraction == pytest.approx(fraction, abs=0.03)
     assert ext.stabilisation_cutoff_hz == pytest.approx(cutoff_hz, rel=0.15)
     assert ext.stabilisation_at_end == at_end
     assert ext.stabilisation_travel_rad == pytest.approx(travel_rad, rel=0.03)

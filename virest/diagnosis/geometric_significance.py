@@ -14,6 +14,7 @@ from virest.diagnosis.cross_validation import JUDGE_POINTS
 from virest.diagnosis.geometric_effects import GeometricEffect
 from virest.diagnosis.geometric_evidence import KNOWN_DEPTH_STD, Evidence, Model, depth_of
 from virest.diagnosis.selection import POINT_LEVELS, WORD_LEVELS
+from virest.effects.table import STABILISED_OFF
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import right_way_round
 from virest.inference.chance import chance_of, chi2_tail
@@ -26,18 +27,21 @@ STABILISER_CUTOFF_HZ = (0.03, 15.0)
 
 
 def refitted(evidence: Evidence, model: Model, points: int) -> tuple[Model, TrackFit]:
-    """Refit a model's terms and scene to at most this many points; a negative readout becomes a positive one."""
+    """Refit a model's terms and scene to at most this many points.
+
+    A negative readout becomes a positive one, and ends that a stabiliser's lens does not reach are dropped.
+    """
     table = evidence.table(model, points)
     fitted = evidence.fit(model, model.terms, table)
+    endless = without_idle_ends(fitted)
+    if endless is not None:
+        fitted = evidence.fit(replace(model, profile=endless), model.terms, table)
     return replace(model, profile=right_way_round(fitted.profile), scene=fitted.scene), fitted
 
 
 def fitted_with(evidence: Evidence, candidate: Candidate) -> tuple[Model, TrackFit]:
-    """Refit the model with the candidate added; a stabiliser without ends, if its lens does not reach them."""
-    model = replace(candidate.model, terms=(*candidate.model.terms, *candidate.added))
-    found, fitted = refitted(evidence, model, JUDGE_POINTS)
-    endless = without_idle_ends(fitted)
-    return (found, fitted) if endless is None else refitted(evidence, replace(found, profile=endless), JUDGE_POINTS)
+    """Refit the model with the candidate added."""
+    return refitted(evidence, replace(candidate.model, terms=(*candidate.model.terms, *candidate.added)), JUDGE_POINTS)
 
 
 def significant(
@@ -93,7 +97,9 @@ def is_plausible(evidence: Evidence, effect: GeometricEffect, found: CameraProfi
     if effect.name == "stabilisation":
         low, high = STABILISER_CUTOFF_HZ
         extensions = found.extensions
-        return 0 < extensions.stabilisation_fraction <= 1.1 and low < extensions.stabilisation_cutoff_hz < high
+        return (
+            0 < extensions.stabilisation_fraction <= STABILISED_OFF and low < extensions.stabilisation_cutoff_hz < high
+        )
     assert effect.effect.steps is not None
     return bool(np.all(np.abs(change) < effect.effect.steps.believable))
 

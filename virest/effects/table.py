@@ -117,6 +117,8 @@ def _applied_axes(profile: CameraProfile) -> str:
 
 GYRO_SCALE_OFF = 0.15
 """Five times the 3 % sensitivity tolerance of phone gyroscopes (BMI160, LSM6DSO, ICM-20602): beyond it is a fault."""
+STABILISED_OFF = 1.1
+"""Fraction of the shake that a stabiliser cancels: all of it, and a tenth for a gyroscope or lens of another scale."""
 ANOTHER_LENS = 1.2
 """Logarithm of the focal ratio: a phone's other lenses have 0.5 to 3 times the focal length of the main one."""
 SENSOR_TURNED = 3.2
@@ -401,7 +403,7 @@ _POINTS = (
             (0.02, 0.1, 0.01, 0.01, 0.5),
             (0.3, 0.5, 0.1, 0.1, 20.0),
             (1.0, 1.5, 0.05, 0.05, 100.0),
-            1.1,
+            STABILISED_OFF,
         ),
         addition=", up to {travel_rad} rad",
         applied=_applied(

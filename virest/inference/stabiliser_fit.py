@@ -21,7 +21,7 @@ from virest.inference.track_fit import TrackFit
 from virest.motion.optics import NO_END_RAD, moving_lens, stabiliser_shift
 from virest.motion.scene_motion import InertialMotion
 
-CUTOFFS_HZ = np.geomspace(0.05, 12.8, 17)
+GRID_CUTOFFS_HZ = np.geomspace(0.05, 12.8, 17)
 """A factor of √2 apart: where the lens reaches an end, fits from twice or half the true cutoff end elsewhere."""
 FRACTIONS = np.array((0.15, 0.3, 0.45, 0.6, 0.75, 0.9))[:, None, None]
 TRAVELS_RAD = np.geomspace(0.004, 0.045, 8)
@@ -58,7 +58,7 @@ def stabiliser_starts(start: FitStart) -> list[CameraProfile]:
         return np.stack([np.interp(both_s, grid_s, path[:, axis]) for axis in (0, 1)], axis=-1)
 
     endless, limited, stopping = [], [], []
-    for cutoff_hz in CUTOFFS_HZ.tolist():
+    for cutoff_hz in GRID_CUTOFFS_HZ.tolist():
         free = FRACTIONS * swing(cutoff_hz, NO_END_RAD)
         endless.append(_best(left, free, cutoff_hz, None))
         for travel_rad in TRAVELS_RAD:

@@ -10,7 +10,7 @@ import numpy as np
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.effects.changes import k1_of, k2_of, mean_gyro_scale
-from virest.effects.table import GYRO_SCALE_OFF
+from virest.effects.table import GYRO_SCALE_OFF, STABILISED_OFF
 from virest.inference import profile_terms as terms_of
 from virest.inference.fit_start import FitStart
 from virest.inference.stabiliser_fit import stabiliser_starts
@@ -31,7 +31,7 @@ K2_REACH, K2_STEPS = 0.1, 3
 LENS_RADII = 9
 """Radii from the centre to the corners at which a lens is checked."""
 MOST_STABILISED = 0.95
-"""No lens cancels more of the shake than this: such frames were cropped and rotated by software."""
+"""No lens without ends cancels more of the shake than this: such frames were cropped and rotated by software."""
 HIGHEST_CUTOFF_HZ = 15.0
 """Highest plausible cutoff of an optical stabiliser.  There is no lowest: within a second, one that follows the camera
 in 10 s acts like one that never does."""
@@ -155,8 +155,10 @@ def _is_lens(given: CameraProfile, found: CameraProfile) -> bool:
 
 
 def _is_stabiliser(_: CameraProfile, found: CameraProfile) -> bool:
-    ext = found.extensions
-    return 0 < ext.stabilisation_fraction < MOST_STABILISED and ext.stabilisation_cutoff_hz < HIGHEST_CUTOFF_HZ
+    ext, most = found.extensions, MOST_STABILISED
+    if ext.stabilisation_travel_rad is not None:
+        most = STABILISED_OFF
+    return 0 < ext.stabilisation_fraction < most and ext.stabilisation_cutoff_hz < HIGHEST_CUTOFF_HZ
 
 
 FOCAL_LENGTH, GYROSCOPE = "focal length", "gyroscope scale"
