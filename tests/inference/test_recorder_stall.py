@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from virest.app.simulate import simulate_command
 from virest.camera.profile import CameraProfile
 from virest.capture.folder import read_capture, resolve_profile
-from virest.capture.records import STALL, Capture
+from virest.capture.records import STALL, STARTUP, Capture
 from virest.capture.video import probe_movie, read_gray
-from virest.inference.recorder_stall import at_shown_times, fit_stall, stall_window
+from virest.inference.recorder_stall import at_shown_times, fit_stall, stall_window, start_up_stalls
+from virest.restoration.lag_plan import at_lag, find_lag
 
 STALLED = (17, 26)
 REPEATS = (22, 24, 26)
@@ -64,6 +65,46 @@ def test_late_frames_get_the_times_of_their_content(recorded: Recorded) -> None:
         assert frame.skip_reason is None
         assert (frame.index, frame.timestamp_ns) == (slot, capture.frames[slot].timestamp_ns)
         assert frame.time_s == capture.frames[shown(slot)].time_s
+
+
+@pytest.mark.parametrize("caught_up", [(23, 25, 27), (25, 26, 30)], ids=["at once", "later"])
+def test_missed_pictures_are_told_from_a_lag(recorded: Recorded, caught_up: tuple[int, int, int]) -> None:
+    """A recorder repeats the previous picture, and is one behind until it drops one: at once, or some slots later."""
+    capture, profile, pictures = recorded
+    repeats = (22, 24, 26) if caught_up[0] == 23 else (22, 25, 27)
+    stall = (16, repeats[-1])
+    behind = {k: sum(r <= k < jump for r, jump in zip(repeats, caught_up, strict=True)) for k in range(40)}
+    late = replace(stalled(capture), stalls=(stall,))
+    seen = {k: pictures[k - behind[k]] for k in stall_window(late, stall)}
+    found = fit_stall(late, profile, stall, seen)
+    assert found is not None
+    assert (found.first, found.last) == (repeats[0], max(k for k in behind if behind[k]))
+    assert found.shows == tuple(k - behind[k] for k in range(found.first, found.last + 1))
+    times = [frame.time_s for frame in at_shown_times(late, [found]).frames]
+    assert times == [capture.frames[k - behind[k]].time_s for k in range(40)]
+
+
+@pytest.mark.parametrize("lags", [False, True])
+def test_missed_pictures_at_the_start_are_no_lag(recorded: Recorded, lags: bool) -> None:
+    """The first 20 frames were taken for a recorder's start-up: those of a recorder that drops pictures are used."""
+    capture, profile, pictures = recorded
+    repeats = (7, 12, 16)
+    if lags:
+        shows = {k: k + sum(repeat > k for repeat in repeats) for k in range(40)}
+    else:
+        shows = {k: k - (k in repeats) for k in range(40)}
+    frames = tuple(
+        replace(f, skip_reason="start-up", skip_codes=(STARTUP,)) if f.index < 20 else f for f in capture.frames
+    )
+    capture = replace(capture, frames=frames, repeats=repeats, startup_lag_s=0.1)
+    lag = find_lag(capture, profile, lambda wanted: ((k, pictures[shows[k]]) for k in wanted))
+    assert lag is not None
+    assert lag.lag_s == pytest.approx(0.1 if lags else 0.0, abs=1e-3)
+    followed = at_lag(capture, profile, lag).frames[:17]
+    assert not any(frame.only_startup for frame in followed)
+    assert [frame.time_s for frame in followed] == [capture.frames[shows[k]].time_s for k in range(17)]
+    states = profile.with_extensions(frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
+    assert start_up_stalls(capture, states) == (() if lags else ((1, 16),))
 
 
 @pytest.mark.parametrize("case", ["as stamped", "another lateness", "slow", "no clock"])

@@ -32,7 +32,7 @@ from virest.capture.location import locate
 from virest.capture.profile_source import PROFILE_NAME
 from virest.capture.video import MovieIndex, probe_movie, read_decodable_gray, read_frames
 from virest.errors import CaptureError, VirestError
-from virest.inference.recorder_stall import at_shown_times, fit_stall, stall_window
+from virest.inference.recorder_stall import at_shown_times, fit_stall, stall_window, start_up_stalls
 from virest.report.words import with_deviation
 from virest.restoration.capture import RestorationPlan, at_true_times
 from virest.restoration.capture_estimation import plan_restoration
@@ -42,7 +42,7 @@ from virest.restoration.undistortion import require_undistortable
 
 log = logging.getLogger(__name__)
 
-MOST_STALLS = 6
+MOST_STALLS = 12
 """Maximum number of stalls that are corrected, the first ones: a bound on the cost for long movies."""
 SHOWN_CHARACTERS = 200
 """Length to which messages cut longer names."""
@@ -314,18 +314,22 @@ def _with_stalls_followed(job: Job, index: MovieIndex, plan: RestorationPlan) ->
     capture, found = job.capture, []
     if plan.copy_reason is not None:
         return job, plan
-    for stall in capture.stalls[:MOST_STALLS]:
+    for stall in (*start_up_stalls(capture, plan.profile), *capture.stalls)[:MOST_STALLS]:
         pictures = read_decodable_gray(capture.movie, index, stall_window(capture, stall))
         fit = fit_stall(capture, plan.profile, stall, dict(pictures))
         if fit is None:
             log.info("%s: the true times of frames %d-%d could not be determined from points", job.name, *stall)
             continue
         found.append(fit)
-        late_s = capture.frames[fit.shows[0]].time_s - capture.frames[fit.first].time_s
+        moved_s = [
+            capture.frames[shown].time_s - capture.frames[slot].time_s
+            for slot, shown in zip(range(fit.first, fit.last + 1), fit.shows, strict=True)
+        ]
+        most_s = max(moved_s, key=abs)
         text = (
-            f"encoder stall corrected: frames {fit.first} to {fit.last}, up to {1e3 * late_s:.0f} ms later than "
-            f"stamped, are used at their true times (remaining error from tracked points {1e3 * fit.rest_s[0]:+.1f} "
-            f"± {1e3 * fit.rest_s[1]:.1f} ms)"
+            f"encoder stall corrected: frames {fit.first} to {fit.last}, up to {1e3 * abs(most_s):.0f} ms "
+            f"{'later' if most_s > 0 else 'earlier'} than stamped, are used at their true times (remaining error from "
+            f"tracked points {1e3 * fit.rest_s[0]:+.1f} ± {1e3 * fit.rest_s[1]:.1f} ms)"
         )
         log.warning("%s: %s", job.name, text)
         plan = plan.noted(NoteCode.TRUE_TIMES, text)

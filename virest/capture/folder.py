@@ -296,7 +296,7 @@ def _later_repeats(files: Source, look: int, motion_px: Array) -> tuple[int, ...
     found: tuple[int, ...] = ()
     # a repeated key frame is as large as any other, so search the neighbourhood of small frames
     for reach in (1, 2 * start.REPEATS_APART):
-        around = sorted({n for k in wanted for n in range(max(k - reach, look), k + reach + 1) if n < len(size)})
+        around = sorted({n for k in wanted for n in range(max(k - reach, look - 1), k + reach + 1) if n < len(size)})
         found = start.find_repeats(_differences(files, around, len(size)), motion_px) if around else ()
         wanted = list(found)
     return found
@@ -306,21 +306,21 @@ def _stall_note(stalls: tuple[tuple[int, int], ...], repeats: tuple[int, ...]) -
     runs = ", ".join(f"{first}–{last}" for first, last in stalls[:8]) + (" …" if len(stalls) > 8 else "")
     seen = f"; frames {', '.join(map(str, repeats))} repeat their predecessor" if repeats else ""
     text = (
-        f"the encoder stalled: frames {runs} may show later content than their timestamps and are skipped, unless "
+        f"the encoder stalled: frames {runs} may show another instant than their timestamps and are skipped, unless "
         f"tracked points determine when they were taken{seen}"
     )
     return Note("warning", "encoder-stall", text)
 
 
 def _startup_note(began: start.Startup) -> Note:
-    seen = []
+    seen, verb = [], "may show"
     if began.unix_lag_s and began.unix_lag_s[0] > began.unix_lag_s[1]:
-        first, steady = began.unix_lag_s
+        (first, steady), verb = began.unix_lag_s, "show"
         seen.append(f"capture-to-encoder delay (Unix columns) falls from {first * 1e3:.0f} to {steady * 1e3:.0f} ms")
     if began.repeats:
         seen.append(f"frames {', '.join(map(str, began.repeats))} repeat their predecessor while the phone rotates")
     text = (
-        f"the first {began.frames} frames show later content than their timestamps, frame 0 by at least "
+        f"the first {began.frames} frames {verb} later content than their timestamps, frame 0 by at least "
         f"{began.lag_s or 0.0:.2f} s: {'; '.join(seen)}"
     )
     return Note("warning", "content-lag", text)

@@ -336,7 +336,8 @@ def _rung(context: SearchContext, model: Model, accepted: list[Accepted]) -> tup
     """Climb one rung; returns (step that enters, step of its rival, record of the rung)."""
     tried = {entry.name for entry in accepted}
     nothing = Candidate("", model, (), None)
-    base, *others = screen(context.evidence, [nothing, *context.candidates(model, tried)], context.each)
+    (base,) = screen(context.evidence, [nothing], context.each)
+    others = race(context.evidence, context.candidates(model, tried), PROMISING, context.each)
     better = [entry for entry in best_of_each(others) if min(np.subtract(entry.losses, base.losses)) < 0]
     trial = context.judged(base, better, PROMISING)
     typical = context.evidence.typical_px

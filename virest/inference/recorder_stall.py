@@ -4,11 +4,14 @@ An encoder that resumes after a pause takes the current picture: from some slot 
 its timestamps, and each of m repeats reduces the lag by one.  So slot k of a stall shows capture k + m − (repeats up to
 k), or its own before the jump.  Repeats are visible, the jump is not, but each position of it predicts other rotations
 between successive frames.  A position is accepted only if it explains the rotations decisively better than any other.
+
+A recorder that misses a picture repeats the previous one instead: the repeat shows a capture that is too early, and so
+do the slots after it if the recorder catches up only later, by dropping a picture.  These positions are tried too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +20,7 @@ from numpy.typing import NDArray
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.records import STALL, Capture
+from virest.capture.startup import REPEATS_APART, find_stalls
 from virest.image_formation.row_clock import RowClock
 from virest.inference.frame_rotations import gyro_turns, picture_rotation
 from virest.inference.observed_tracks import MIN_TRACKS
@@ -24,12 +28,15 @@ from virest.inference.tracking import TrackPair, track_pairs
 from virest.motion.integration import integrate_gyro
 from virest.motion.trajectory import Trajectory
 
-CONTEXT = 8
-"""Frames with correct timestamps on both sides of a stall, which determine the scatter of the rotations."""
+CONTEXT = 8 + REPEATS_APART
+"""Frames on both sides of a stall; those beyond REPEATS_APART are at their timestamps, and determine the scatter of the
+rotations."""
 MIN_CONTEXT = 6
 """Fewest of these whose rotations could be measured."""
 REPEAT_PX, MOVED_PX = 0.1, 0.5
 """A frame repeats its predecessor if points move less than REPEAT_PX where the gyroscope predicts over MOVED_PX."""
+AFTER_REPEAT = 2
+"""Frames after another stall's repeat whose rotations do not count as usual: content may catch up there."""
 LEAST_NOISE_PX = 0.1
 """Least scatter of the rotations that is assumed, px at the focal length."""
 DECISIVE_CHI2 = 37.0
@@ -45,8 +52,10 @@ MOST_RMS_RATIO = 1.5
 class Retimed:
     """A stall whose content was identified."""
 
+    stall: tuple[int, int]
+    """First and last slot as reported."""
     first: int
-    """First slot with late content."""
+    """First slot that may show another capture than its own."""
     last: int
     shows: tuple[int, ...]
     """The capture that each slot from ``first`` to ``last`` shows."""
@@ -57,6 +66,13 @@ class Retimed:
 def stall_window(capture: Capture, stall: tuple[int, int]) -> range:
     """The frames to analyse."""
     return range(max(stall[0] - CONTEXT, 0), min(stall[1] + CONTEXT + 1, len(capture.frames)))
+
+
+def start_up_stalls(capture: Capture, profile: CameraProfile) -> tuple[tuple[int, int], ...]:
+    """The runs around repeats among the first frames, of a profile that states that these have no recorder lag."""
+    last, lag_s = profile.extensions.frame_lag_frames, profile.extensions.frame_lag_s
+    repeats = tuple(repeat for repeat in capture.repeats if repeat <= last)
+    return find_stalls(repeats, None, 1, 0.0) if repeats and not lag_s else ()
 
 
 def fit_stall(
@@ -80,30 +96,34 @@ def fit_stall(
         return gyro_turns(trajectory, time_s[list(first)], time_s[list(second)]) * lens.fx_px
 
     expected = dict(zip(slots, predicted_px([k - 1 for k in slots], slots), strict=True))
-    repeats = [
-        k
-        for k in slots
-        if stall[0] < k <= stall[1] and np.linalg.norm(expected[k]) > MOVED_PX and _is_repeat(pairs.get(k))
-    ]
-    seen = [k for k in slots if pairs.get(k) is not None and k not in repeats]
+    repeated = [k for k in slots if np.linalg.norm(expected[k]) > MOVED_PX and _is_repeat(pairs.get(k))]
+    repeats = [k for k in repeated if stall[0] < k <= stall[1]]
+    seen = [k for k in slots if pairs.get(k) is not None and k not in repeated]
     turned = np.array([picture_rotation(lens, pairs[k]) for k in seen]).reshape(-1, 3) * lens.fx_px
-    inside = np.array([stall[0] <= k <= stall[1] + 1 for k in seen], bool)
-    if not repeats or (~inside).sum() < MIN_CONTEXT or not inside.any():
+    inside = np.array([stall[0] <= k <= stall[1] + REPEATS_APART + 1 for k in seen], bool)
+    elsewhere = [np.array(seen) - repeat for repeat in repeated if repeat not in repeats]
+    around = ~inside & ~np.any([(after >= 0) & (after <= AFTER_REPEAT) for after in elsewhere], axis=0)
+    if not repeats or around.sum() < MIN_CONTEXT or not inside.any():
         return None
     if stall[1] + len(repeats) >= len(capture.frames):
         return None
-    trials = [_shows(window, start, repeats) for start in range(stall[0], repeats[0])]
-    stamped = dict(zip(window, window, strict=True))
-    left = np.array(
-        [turned - predicted_px([shows[k - 1] for k in seen], [shows[k] for k in seen]) for shows in (stamped, *trials)]
-    )
-    noise_px = max(float(np.sqrt(np.mean(left[0][~inside] ** 2))), LEAST_NOISE_PX)
-    chi2 = (left[:, inside] ** 2).sum(axis=(1, 2)) / noise_px**2
-    best = int(np.argmin(chi2))
-    unexplained = chi2[best] > MOST_RMS_RATIO**2 * 3 * inside.sum()
-    if best == 0 or unexplained or np.partition(chi2, 1)[1] - chi2[best] < DECISIVE_CHI2:
+
+    def left_px(trial: _Trial) -> Array:
+        shows = trial[1]
+        return np.asarray(turned - predicted_px([shows[k - 1] for k in seen], [shows[k] for k in seen]))
+
+    late = [(start, _shows(window, start, repeats)) for start in range(stall[0], repeats[0])]
+    early = _early_trials(window, repeats, lambda trial: float((left_px(trial)[inside] ** 2).sum()))
+    trials = [*late, *early]
+    left = np.array([left_px(trial) for trial in trials])
+    noise_px = max(float(np.sqrt(np.mean(left[0][around] ** 2))), LEAST_NOISE_PX)
+    misfit = (left[:, inside] ** 2).sum(axis=(1, 2)) / noise_px**2
+    best = int(np.argmin(misfit))
+    unexplained = misfit[best] > MOST_RMS_RATIO**2 * 3 * inside.sum()
+    if unexplained or np.partition(misfit, 1)[1] - misfit[best] < DECISIVE_CHI2:
         return None
-    start, shows = stall[0] + best - 1, trials[best - 1]
+    start, shows = trials[best]
+    last = max([stall[1], *(k for k in window if shows[k] != k)])
     within = [k for k, i in zip(seen, inside, strict=True) if i]
     rest_s = _rest_s(
         trajectory, time_s[[shows[k - 1] for k in within]], time_s[[shows[k] for k in within]],
@@ -111,7 +131,7 @@ def fit_stall(
     )  # fmt: skip
     if abs(rest_s[0]) > max(OTHER_SIGMA * rest_s[1], MOST_REST * float(np.median(np.diff(time_s)))):
         return None
-    return Retimed(start, stall[1], tuple(shows[k] for k in range(start, stall[1] + 1)), rest_s)
+    return Retimed(stall, start, last, tuple(shows[k] for k in range(start, last + 1)), rest_s)
 
 
 def _rest_s(
@@ -130,7 +150,8 @@ def at_shown_times(capture: Capture, found: Sequence[Retimed]) -> Capture:
     frames = list(capture.frames)
     for one in found:
         shows = dict(zip(range(one.first, one.last + 1), one.shows, strict=True))
-        for slot in _stalled(capture, one):
+        # slots before the jump are at their timestamps
+        for slot in range(one.stall[0], one.last + 1):
             source, frame = capture.frames[shows.get(slot, slot)], frames[slot]
             only = frame.skip_codes == (STALL,)
             frames[slot] = replace(
@@ -141,12 +162,6 @@ def at_shown_times(capture: Capture, found: Sequence[Retimed]) -> Capture:
                 skip_codes=() if only else frame.skip_codes,
             )
     return replace(capture, frames=tuple(frames))
-
-
-def _stalled(capture: Capture, one: Retimed) -> range:
-    """All slots of the stall with a retimed part, including those before its jump, whose timestamps are correct."""
-    first = next(first for first, last in capture.stalls if first <= one.first <= last)
-    return range(first, one.last + 1)
 
 
 def _pair(pictures: Mapping[int, NDArray[np.uint8]], k: int) -> TrackPair | None:
@@ -166,6 +181,28 @@ def _middle_s(capture: Capture, profile: CameraProfile) -> Array:
     stamp_s = np.array([frame.time_s for frame in capture.frames])
     exposure_s = np.array([frame.exposure_s or 0.0 for frame in capture.frames])
     return np.asarray(RowClock(profile).middle_s(stamp_s, exposure_s))
+
+
+_Trial = tuple[int, dict[int, int]]
+"""The first slot that may show another capture than its own, and the capture that each slot shows."""
+
+
+def _early_trials(window: range, repeats: Sequence[int], misfit: Callable[[_Trial], float]) -> list[_Trial]:
+    """Content too early from each repeat until a jump: the positions of one jump after the other, the best one kept."""
+    jumps = [next(k for k in range(repeat, window[-1] + 2) if k not in repeats) for repeat in repeats]
+    found: list[_Trial] = []
+    for i, earliest in enumerate(jumps):
+        latest = min([r for r in repeats if r >= earliest] + [earliest + REPEATS_APART, window[-1]])
+        tried = [[*jumps[:i], jump, *jumps[i + 1 :]] for jump in range(earliest, latest + 1)]
+        trials = [(repeats[0], _shows_early(window, repeats, at)) for at in tried]
+        jumps = tried[int(np.argmin([misfit(trial) for trial in trials]))]
+        found += [trial for trial in trials if trial not in found]
+    return found
+
+
+def _shows_early(window: range, repeats: Sequence[int], jumps: Sequence[int]) -> dict[int, int]:
+    """The capture that each slot shows if content is too early from each repeat until the jump that belongs to it."""
+    return {k: k - sum(r <= k < jump for r, jump in zip(repeats, jumps, strict=True)) for k in window}
 
 
 def _shows(window: range, start: int, repeats: Sequence[int]) -> dict[int, int]:

@@ -52,20 +52,26 @@ def stabiliser_starts(start: FitStart) -> list[CameraProfile]:
     left = (table.second_px - at.second_px) / (lens.fx_px, lens.fy_px) + own
     grid_s = np.arange(known.trajectory.span_s[0], known.trajectory.span_s[1], GRID_S)
     rate = known.trajectory.rate_rad_s(grid_s)
+    knot = np.clip(np.searchsorted(grid_s, both_s) - 1, 0, len(grid_s) - 2)
+    after = np.clip((both_s - grid_s[knot]) / (grid_s[knot + 1] - grid_s[knot]), 0.0, 1.0)[:, None]
+    before = 1.0 - after
 
-    def swing(cutoff_hz: float, stop_rad: float) -> Array:
+    def swing(cutoff_hz: Array | float, stop_rad: Array | float) -> Array:
+        """Shifts (..., 2 n, 2) of lenses that cancel all of the shake above cutoffs (...), between ends ± stop_rad."""
         path = stabiliser_shift(grid_s, rate, 1.0, cutoff_hz, travel_rad=stop_rad)
-        return np.stack([np.interp(both_s, grid_s, path[:, axis]) for axis in (0, 1)], axis=-1)
+        return before * path[..., knot, :] + after * path[..., knot + 1, :]
 
     endless, limited, stopping = [], [], []
-    for cutoff_hz in GRID_CUTOFFS_HZ.tolist():
-        free = FRACTIONS * swing(cutoff_hz, NO_END_RAD)
-        endless.append(_best(left, free, cutoff_hz, None))
+    free = swing(GRID_CUTOFFS_HZ, NO_END_RAD)
+    for cutoff_hz, own_free in zip(GRID_CUTOFFS_HZ.tolist(), free, strict=True):
+        path = FRACTIONS * own_free
+        endless.append(_best(left, FRACTIONS * _step(own_free), cutoff_hz, None))
         for travel_rad in TRAVELS_RAD:
-            limited.append(_best(left, np.clip(free, -travel_rad, travel_rad), cutoff_hz, travel_rad))
-        for stop_rad in STOP_RAD:
+            clipped = np.minimum(np.maximum(path, -travel_rad), travel_rad)
+            limited.append(_best(left, _step(clipped), cutoff_hz, travel_rad))
+        for stop_rad, stopped in zip(STOP_RAD, swing(cutoff_hz, STOP_RAD), strict=True):
             travels_rad = FRACTIONS.ravel() * stop_rad
-            stopping.append(_best(left, FRACTIONS * swing(cutoff_hz, stop_rad), cutoff_hz, travels_rad))
+            stopping.append(_best(left, FRACTIONS * _step(stopped), cutoff_hz, travels_rad))
     found = []
     for judged, at_end in ((endless, RUNS_ON), (limited, RUNS_ON), (stopping, STOPS)):
         _, fraction, cutoff_hz, travel_rad = min(judged)
@@ -98,9 +104,10 @@ Judged = tuple[float, float, float, float | None]
 """Points' median squared distance; fraction, cutoff (Hz) and travel (rad) of a stabiliser."""
 
 
-def _best(left: Array, shift: Array, cutoff_hz: float, travel_rad: Array | float | None) -> Judged:
-    """The best of stabilisers with shifts (fractions, 2 n, 2), where points (n, 2) lie off by ``left``."""
-    distance = np.median(((left - _step(shift)) ** 2).sum(axis=-1), axis=-1)
+def _best(left: Array, step: Array, cutoff_hz: float, travel_rad: Array | float | None) -> Judged:
+    """The best of stabilisers that move points by steps (fractions, n, 2), where the points lie off by ``left``."""
+    off = left - step
+    distance = np.median(np.einsum("fni,fni->fn", off, off), axis=-1)
     best = int(np.argmin(distance))
     travel = None if travel_rad is None else float(np.broadcast_to(travel_rad, len(distance))[best])
     return float(distance[best]), float(FRACTIONS.ravel()[best]), cutoff_hz, travel

@@ -28,6 +28,8 @@ SETTLED = 16.0
 """After this many time constants 1 / (2π cutoff) the high-pass filter's initial state has decayed to 1e-7."""
 RADIUS_STEPS = 5
 """A scale over the radius changes by a few percent: each step of its inversion reduces the error by that factor."""
+MOST_GROWTH = 300.0
+"""Decays are summed in parts whose inverse grows to at most exp of twice this: 1e261 can be represented."""
 _SMALL = 1e-4
 """Below it the series, which errs by x³/24, is closer than the closed form, which loses 2e-16 / x to cancellation."""
 
@@ -186,23 +188,30 @@ def stabiliser_shift(
     time_s: Array,
     rate_cam_rad_s: Array,
     fraction: float,
-    cutoff_hz: float,
+    cutoff_hz: Array | float,
     lean_rad: Array | tuple[float, float] = (0.0, 0.0),
-    travel_rad: float = NO_END_RAD,
+    travel_rad: Array | float = NO_END_RAD,
 ) -> Array:
-    """Shift (n, 2) in units of the focal length: x += fraction θ_y, y −= fraction θ_x.
+    """Shift (..., n, 2) in units of the focal length: x += fraction θ_y, y −= fraction θ_x.
 
     θ' = ω − 2π cutoff θ, solved exactly for a rate (n, 3), camera axes, that is linear between the times (n,); the
-    filter stops where fraction θ reaches ± travel_rad.  lean_rad: θ at the first time.
+    filter stops where fraction θ reaches ± travel_rad.  lean_rad: θ at the first time.  cutoff_hz, travel_rad (...).
     """
     step_s = np.diff(time_s)
-    decayed = 2 * np.pi * cutoff_hz * step_s
+    decayed = 2 * np.pi * np.multiply.outer(cutoff_hz, step_s)[..., None, :]
     mean, ramp = _exponential_means(decayed)
-    rate = rate_cam_rad_s[:, :2]
-    drive = step_s[:, None] * ((mean - ramp)[:, None] * rate[:-1] + ramp[:, None] * rate[1:])
-    end = travel_rad / max(abs(fraction), _SMALL)
-    theta = _running_response(np.exp(-decayed), drive, np.clip(lean_rad, -end, end), end)
-    return fraction * np.stack([theta[:, 1], -theta[:, 0]], axis=-1)
+    rate = np.ascontiguousarray(rate_cam_rad_s[:, :2].T)
+    drive = step_s * ((mean - ramp) * rate[:, :-1] + ramp * rate[:, 1:])
+    end = np.minimum(travel_rad, NO_END_RAD)[..., None, None] / max(abs(fraction), _SMALL)
+    start = np.clip(np.asarray(lean_rad)[:, None], -end, end)
+    shape = np.broadcast_shapes(drive[..., :1].shape, start.shape)
+    start, drive = np.broadcast_to(start, shape), np.broadcast_to(drive, (*shape[:-1], len(step_s)))
+    if np.all(travel_rad >= NO_END_RAD):
+        theta = _free_response(decayed, drive, start)
+    else:
+        theta = _limited_response(np.exp(-decayed), drive, start, np.broadcast_to(end, drive.shape))
+    theta = np.concatenate([start, theta], axis=-1)
+    return fraction * np.swapaxes(np.stack([theta[..., 1, :], -theta[..., 0, :]], axis=-2), -1, -2)
 
 
 def _exponential_means(x: Array) -> tuple[Array, Array]:
@@ -213,12 +222,24 @@ def _exponential_means(x: Array) -> tuple[Array, Array]:
     return mean, ramp
 
 
-def _running_response(decay: Array, drive: Array, start: Array, end: float) -> Array:
-    """θ[0] = start, θ[k + 1] = decay[k] θ[k] + drive[k], between ± end. Returns (n + 1, 2)."""
+def _free_response(decayed: Array, drive: Array, start: Array) -> Array:
+    """θ[1:] for θ[k + 1] = exp(−decayed[k]) θ[k] + drive[k], from θ[0] = start; time is the last axis."""
+    decayed = np.minimum(decayed, MOST_GROWTH)
+    total = np.cumsum(decayed.reshape(-1, decayed.shape[-1]).max(axis=0)) // MOST_GROWTH
+    limits = [0, *(np.flatnonzero(np.diff(total)) + 1).tolist(), len(total)]
+    found = np.empty_like(drive)
+    for part in map(slice, limits[:-1], limits[1:]):
+        growth = np.exp(np.cumsum(decayed[..., part], axis=-1))
+        found[..., part] = (start + np.cumsum(drive[..., part] * growth, axis=-1)) / growth
+        start = found[..., part][..., -1:]
+    return found
+
+
+def _limited_response(decay: Array, drive: Array, start: Array, end: Array) -> Array:
+    """θ[1:] for θ[k + 1] = decay[k] θ[k] + drive[k], between ± end, from θ[0] = start; time is the last axis."""
     drive = drive.copy()
-    drive[:1] += decay[:1, None] * start
-    ends = np.full_like(drive, end)
-    return np.concatenate([start[None], _responses(decay[:, None], drive, -ends, ends)])
+    drive[..., :1] += decay[..., :1] * start
+    return _responses(decay, drive, -end, end)
 
 
 def _responses(decay: Array, drive: Array, low: Array, high: Array) -> Array:
@@ -226,16 +247,16 @@ def _responses(decay: Array, drive: Array, low: Array, high: Array) -> Array:
 
     log2(n) vectorised passes, 2 n steps in all.
     """
-    if len(drive) < 2:
+    if drive.shape[-1] < 2:
         return np.clip(drive, low, high)
     found = np.empty_like(drive)
-    found[0] = np.clip(drive[0], low[0], high[0])
-    second = decay[1::2], drive[1::2], low[1::2], high[1::2]
-    both = (_step(part[:-1:2], *second) for part in (low, high))
-    found[1::2] = _responses(decay[:-1:2] * second[0], second[0] * drive[:-1:2] + second[1], *both)
-    found[2::2] = _step(found[1:-1:2], decay[2::2], drive[2::2], low[2::2], high[2::2])
+    found[..., :1] = np.clip(drive[..., :1], low[..., :1], high[..., :1])
+    odd, even, later = np.s_[..., 1::2], np.s_[..., :-1:2], np.s_[..., 2::2]
+    both = (_step(part[even], decay[odd], drive[odd], low[odd], high[odd]) for part in (low, high))
+    found[odd] = _responses(decay[even] * decay[odd], decay[odd] * drive[even] + drive[odd], *both)
+    found[later] = _step(found[..., 1:-1:2], decay[later], drive[later], low[later], high[later])
     return found
 
 
 def _step(theta: Array, decay: Array, drive: Array, low: Array, high: Array) -> Array:
-    return np.clip(decay * theta + drive, low, high)
+    return np.minimum(np.maximum(decay * theta + drive, low), high)

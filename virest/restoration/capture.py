@@ -16,6 +16,7 @@ from virest.capture.imu import ImuSamples
 from virest.capture.join import median_period_s, outside_reason
 from virest.image_formation.row_motion import FrameTranslation, RowMotion, row_motion
 from virest.inference.frame_exposures import OwnExposures
+from virest.inference.recorder_lag import as_stamped
 from virest.inference.unsharp_mask import UnsharpMask, without_mask
 from virest.motion.integration import integrate_gyro
 from virest.motion.optics import MovingLens, moving_lens
@@ -244,23 +245,24 @@ def at_true_times(frames: Sequence[Frame], profile: CameraProfile, repeats: Sequ
     frame_lag: slot k shows capture k + lag − repeats so far; exact repeats reduce the lag to 0 over the first slots.
     repeats: slots observed to repeat.  If their number differs from the lag, repeats are assumed evenly spaced, unless
     the movie ends before the lag reaches 0: then the observed ones are used, and all slots keep the remaining lag.
-    Frames that were skipped only for the start-up become usable.  Exposures logged in other rows are given back.
+    A lag of 0 s: the first slots show what they are stamped, but each repeat shows what its predecessor shows.  Frames
+    that were skipped only for the start-up become usable.  Exposures logged in other rows are given back.
     """
     frames = OwnExposures.stated_by(profile).of(frames)
     lagging = profile.extensions.frame_lag_frames
     period_s = median_period_s(np.array([frame.time_s for frame in frames]))
     periods = profile.extensions.frame_lag_s / period_s if period_s > 0 else 0.0
-    lag, last = round(periods), lagging
-    if not lagging or not lag:
+    lag, last, slots = round(periods), lagging, np.arange(len(frames))
+    if not lagging:
         return tuple(frames)
     used = np.sort(np.array([slot for slot in repeats if 0 < slot <= lagging], int))
     unfinished = 0 < len(used) < periods and lagging >= LAG_TO_THE_END * len(frames)
     if unfinished:
         lag, last = int(periods + ALMOST), len(frames) - 1
-    elif len(used) != lag:
+    elif lag and len(used) != lag:
         used = np.round(np.arange(1, lag + 1) * lagging / lag).astype(int)
     rest_s = (periods - lag) * period_s if unfinished else 0.0
-    shows = np.arange(len(frames)) + lag - np.searchsorted(used, np.arange(len(frames)), side="right")
+    shows = slots + lag - np.searchsorted(used, slots, side="right") if lag else as_stamped(slots, used)
     early = [_showing(frame, frames, int(shows[k]), period_s, rest_s) for k, frame in enumerate(frames[: last + 1])]
     return (*early, *frames[last + 1 :])
 

@@ -25,7 +25,7 @@ SOURCE = "repeated frames, and frame rotations against the gyroscope"
 
 
 def find_lag(capture: Capture, profile: CameraProfile, read_gray: GrayReader) -> StartUpLag | None:
-    """The lag of the first frames; None: no sign of one, or rotations do not agree better with it than without."""
+    """The lag of the first frames, 0 s if they have none; None: no sign of one, or rotations do not tell."""
     lagging = [frame.index for frame in capture.frames if frame.only_startup][:MOST_FRAMES]
     if profile.extensions.frame_lag_frames or not capture.repeats or len(lagging) <= MIN_PAIRS:
         return None
@@ -45,6 +45,8 @@ def with_lag(plan: RestorationPlan, lag: StartUpLag) -> RestorationPlan:
     """A plan that was made at true times, with the lag added to its profiles and notes."""
     contradicted = None if plan.contradicted is None else _profile_with_lag(plan.contradicted, lag)
     text = f"recorder lag of {lag.lag_s:.2f} s: the first {lag.frames} frames are used at their true times"
+    if not lag.lag_s:
+        text = f"repeated frames mean no recorder lag: up to frame {lag.frames}, {lag.note}"
     profile = _profile_with_lag(plan.profile, lag)
     return replace(plan, profile=profile, contradicted=contradicted).noted(NoteCode.TRUE_TIMES, text)
 
