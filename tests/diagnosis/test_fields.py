@@ -39,7 +39,7 @@ from virest.diagnosis.field.design import point_residuals
 from virest.diagnosis.field.form_list import form_of_late_frames, forms_of_pairs
 from virest.diagnosis.field.records import Distrusted
 from virest.diagnosis.field.search import is_believable
-from virest.diagnosis.field.stretches import KNOT_STEP_S, bridging_form
+from virest.diagnosis.field.stretches import bridging_form
 from virest.diagnosis.field.sudden import best_instant, sudden_change
 from virest.diagnosis.field.words import finding_of
 from virest.diagnosis.findings import FieldFinding
@@ -50,6 +50,7 @@ from virest.diagnosis.ladder import with_exposure_of
 from virest.diagnosis.picture_ladder import PictureVerdict
 from virest.image_formation.point_model import TrackTable
 from virest.inference.doubtful_log import Stretch, doubtful_stretches
+from virest.inference.log_bridges import KNOT_STEP_S
 from virest.inference.profile_terms import FOCAL_DRIFT, GYRO_BIAS, K1, PRINCIPAL_POINT
 from virest.inference.term import slopes_of
 from virest.inference.track_fit import Term, TrackFit

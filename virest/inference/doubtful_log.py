@@ -115,7 +115,8 @@ def _clipped(imu: ImuSamples) -> list[Stretch]:
         if limit is not None:
             found += [
                 Stretch(CLIPPED, time_s[max(first - 1, 0)], time_s[min(last + 1, end)], (axis,), limit.rate_rad_s)
-                for first, last in _runs(reading >= limit.least_rad_s)
+                for first, last in _runs(reading >= limit.lowest_rad_s)
+                if reading[first : last + 1].max() >= limit.least_rad_s
             ]
     return found
 
@@ -128,6 +129,11 @@ class _Pile:
     """Their median."""
     least_rad_s: float
     """As far below it as the largest is above: noise after the limit spreads them both ways."""
+
+    @property
+    def lowest_rad_s(self) -> float:
+        """Twice as far below it: a reading that noise puts between this and ``least_rad_s`` does not end a stretch."""
+        return 2 * self.least_rad_s - self.rate_rad_s
 
 
 def _pile(reading: Array, least: float) -> _Pile | None:

@@ -34,7 +34,9 @@ def rates_given_log(imu: ImuSamples, axis: int, time_s: Array, untrusted: Sequen
     rate, outside = imu.gyro_rad_s[:, axis], np.ones(len(imu), bool)
     beyond, side, least = np.zeros(len(imu)), np.zeros(len(time_s)), np.zeros(len(time_s))
     for stretch in untrusted:
-        inside = (imu.time_s > stretch.from_s) & (imu.time_s < stretch.to_s)
+        begun = stretch.from_s if stretch.from_s > imu.time_s[0] else -np.inf  # at an end of the log nothing is trusted
+        ended = stretch.to_s if stretch.to_s < imu.time_s[-1] else np.inf
+        inside = (imu.time_s > begun) & (imu.time_s < ended)
         outside &= ~inside
         if stretch.kind == CLIPPED and stretch.limit_rad_s is not None and inside.any():
             clipped_s, way = imu.time_s[inside], np.sign(rate[inside].mean())

@@ -27,6 +27,7 @@ from virest.inference.doubtful_log import doubts
 from virest.inference.frame_exposures import OwnExposures
 from virest.inference.frame_selection import choose_pairs
 from virest.inference.guide_choice import find_guide
+from virest.inference.log_bridges import with_expected_rates
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.spectral_limit import allow, widest_gaussian_px
 from virest.inference.synchronisation import (
@@ -97,6 +98,11 @@ def plan_restoration(
     coding: how frames were coded, by frame index, filled in as frames are read; missing: unknown.
     """
     coding = {} if coding is None else coding
+    bridged = with_expected_rates(profile, capture.imu, capture.stamp_0_ns)
+    if bridged is not profile:
+        notes = tuple(PlanNote(NoteCode.DOUBTFUL_LOG, text) for text in doubts(capture.imu, profile))
+        plan = plan_restoration(capture, bridged, settings, read_gray, coding)
+        return replace(plan, said=(*notes, *plan.said))
     if own := OwnExposures.stated_by(profile):
         capture = replace(capture, frames=own.of(capture.frames))
         even = profile.with_extensions(exposures_late_frames=0, exposure_gain=())
@@ -523,8 +529,8 @@ def resting_points(lens: MovingLens, profile: CameraProfile, frame: Frame, point
 
 
 def _default_notes(profile: CameraProfile, capture: Capture) -> tuple[PlanNote, ...]:
-    """A note for each unknown value, which is set to its documented default, and on a log that looks wrong."""
-    notes = [PlanNote(NoteCode.DOUBTFUL_LOG, text) for text in doubts(capture.imu, profile)]
+    """A note for each unknown value, which is set to its documented default."""
+    notes = []
     if profile.response is None:
         notes.append(PlanNote(NoteCode.DEFAULT_TAKEN, "exposure curve unknown: srgb assumed"))
     if not profile.readout_known:
