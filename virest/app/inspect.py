@@ -38,7 +38,7 @@ def as_json(capture: Capture) -> dict[str, Any]:
     frame_period, imu_period = median_period_s(frame_s), median_period_s(capture.imu.time_s)
     logged = capture.metadata
     profile_source, profile_notes = _profile_source(capture)
-    log_notes = [Note("warning", "inertial-log", text) for text in doubts(capture.imu)]
+    log_notes = [Note("warning", "inertial-log", f"{text}: virest diagnose") for text in doubts(capture.imu)]
     return {
         "capture": capture.name,
         "folder": str(capture.folder),

@@ -76,7 +76,7 @@ def doubts(imu: ImuSamples, profile: CameraProfile | None = None) -> list[str]:
         look = f"clipped at {np.median(limits):.3g} rad/s" if limits else "interpolated across a gap"
         count, first_s = len(stretches), stretches[0].from_s
         where = f"in {count} stretches, the first from {first_s:.2f} s" if count > 1 else f"from {first_s:.2f} s"
-        lines.append(f"the gyroscope log looks {look} {where}: virest diagnose")
+        lines.append(f"the gyroscope log looks {look} {where}")
     return lines
 
 
@@ -115,8 +115,7 @@ def _clipped(imu: ImuSamples) -> list[Stretch]:
         if limit is not None:
             found += [
                 Stretch(CLIPPED, time_s[max(first - 1, 0)], time_s[min(last + 1, end)], (axis,), limit.rate_rad_s)
-                for first, last in _runs(reading >= limit.lowest_rad_s)
-                if reading[first : last + 1].max() >= limit.least_rad_s
+                for first, last in _runs(_at_limit(reading, limit))
             ]
     return found
 
@@ -145,6 +144,16 @@ def _pile(reading: Array, least: float) -> _Pile | None:
         if _is_pile(reading, part * limit, least_swings):
             return _pile_within(reading, part * limit)
     return None
+
+
+def _at_limit(reading: Array, limit: _Pile) -> Mask:
+    """Which readings (n,) belong to the pile, with those between two of them that noise puts just below it."""
+    inside: Mask = np.asarray(reading >= limit.least_rad_s)
+    for first, last in _runs(np.asarray(reading >= limit.lowest_rad_s)):
+        own = first + np.flatnonzero(inside[first : last + 1])
+        if len(own):
+            inside[own[0] : own[-1]] = True
+    return inside
 
 
 def _same_pile(reading: Array, known: _Pile) -> _Pile | None:

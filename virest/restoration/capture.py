@@ -28,7 +28,7 @@ from virest.restoration.frame import (
     restore_frame,
 )
 from virest.restoration.neighbours.confirmation import ConfirmedGain
-from virest.restoration.neighbours.refinement import MissingTurn, with_uncertain_rates
+from virest.restoration.neighbours.refinement import MissingTurn
 from virest.restoration.neighbours.sights import FrameNeighbours, Sight, with_neighbours
 from virest.restoration.parameters import degradation_parameters, unknown_parameters
 from virest.restoration.plan_notes import NoteCode, PlanNote
@@ -111,7 +111,7 @@ class RestorationPlan:
         if self.copy_reason is not None:
             return 0
         if self.settings.deblur == "none":
-            return 0 if self.missing_turn is None else 1
+            return 0 if self.missing_turn is None and not self.profile.over_time("rate") else 1
         return max(self.most_joined_on_a_side, FRAMES_BACK)
 
     @property
@@ -183,7 +183,7 @@ def restore_frames(
         if neighbours is not None:
             count = max(plan.most_joined_on_a_side, 1)
             near_before, near_after = before[max(len(before) - count, 0) :], after[:count]
-            refined = with_uncertain_rates(neighbours.refined(near_before, here, near_after), motion)
+            refined = neighbours.refined(near_before, here, near_after)
             if plan.most_joined_on_a_side and plan.settings.most_joined:
                 joined = (*near_before, *near_after)
                 compared = partial(neighbours.joined, joined, here, refined, plan.settings.most_joined)

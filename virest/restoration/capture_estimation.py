@@ -100,7 +100,8 @@ def plan_restoration(
     coding = {} if coding is None else coding
     bridged = with_expected_rates(profile, capture.imu, capture.stamp_0_ns)
     if bridged is not profile:
-        notes = tuple(PlanNote(NoteCode.DOUBTFUL_LOG, text) for text in doubts(capture.imu, profile))
+        inferred = "rates there are inferred from the readings around; virest diagnose estimates them from points"
+        notes = tuple(PlanNote(NoteCode.DOUBTFUL_LOG, f"{text}: {inferred}") for text in doubts(capture.imu, profile))
         plan = plan_restoration(capture, bridged, settings, read_gray, coding)
         return replace(plan, said=(*notes, *plan.said))
     if own := OwnExposures.stated_by(profile):

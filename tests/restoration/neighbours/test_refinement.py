@@ -9,8 +9,10 @@ import pytest
 from laws import TurningCamera, phone
 
 from virest.camera.field import Field
+from virest.image_formation.row_motion import RowMotion
 from virest.motion.trajectory import Trajectory
 from virest.restoration.neighbours.refinement import (
+    HALF_SPACING,
     NEGLIGIBLE_PX,
     FollowingTurn,
     MissingTurn,
@@ -18,9 +20,9 @@ from virest.restoration.neighbours.refinement import (
     accepted_turn,
     following_turn,
     missing_turn,
+    uncertain_rate_rad_s,
     undetected_rad_s,
     with_bias,
-    with_uncertain_rates,
 )
 from virest.restoration.neighbours.registration import PairTurn
 
@@ -169,35 +171,31 @@ def test_position_uncertainty_follows_from_speed_uncertainty() -> None:
     assert RefinedMotion(motion, np.zeros((3, 3)), 0.0).position_std_px() == 0.0
 
 
-def test_an_uncertain_rate_makes_the_path_of_its_rows_uncertain() -> None:
-    """A rate that is uncertain by σ for all rows moves the path's end by f σ exposure; outside the rows by nothing."""
+def _bridged(motion: RowMotion, from_s: float, to_s: float, std_rad_s: float) -> RowMotion:
+    """The motion with a bridge whose rate about x is uncertain."""
+    knots = tuple(np.linspace(from_s, to_s, 4).tolist())
+    bridge = Field("rate", ("time",), (knots,), ((0.0,) * 3,) * 4, ((std_rad_s, 0.0, 0.0),) * 4)
+    return replace(motion, profile=motion.profile.with_extensions(field=(bridge,)))
+
+
+def test_a_bridge_makes_the_rate_of_its_rows_uncertain() -> None:
+    """By its deviation if it covers all rows, by less if it covers some; outside the rows, or if negligible, by 0."""
     motion = TurningCamera(phone()).motion
-    lens = motion.profile.intrinsics
-    assert lens is not None
-
-    def std_px(from_s: float, to_s: float) -> float:
-        knots = tuple(np.linspace(from_s, to_s, 4).tolist())
-        bridge = Field("rate", ("time",), (knots,), ((0.0,) * 3,) * 4, ((0.1,) * 3,) * 4)
-        bridged = replace(motion, profile=motion.profile.with_extensions(field=(bridge,)))
-        found = with_uncertain_rates(None, bridged)
-        return 0.0 if found is None else float(np.sqrt(np.trace(found.path_covariance_px2()) / 2))
-
-    whole = std_px(motion.start_s - 0.01, motion.end_s + 0.01)
-    assert whole == pytest.approx(lens.fx_px * 0.1 * motion.exposure_s, rel=0.02)
-    assert std_px(motion.end_s + 0.001, motion.end_s + 0.03) == 0.0
-    half = std_px(0.5 * (motion.start_s + motion.end_s), motion.end_s + 0.01)
-    assert half == pytest.approx(whole / np.sqrt(2), rel=0.05)
+    middle_s = 0.5 * (motion.start_s + motion.end_s)
+    spans = [(motion.start_s - 0.01, 0.1), (middle_s, 0.1), (motion.end_s + 0.001, 0.1), (motion.start_s - 0.01, 1e-4)]
+    found = [uncertain_rate_rad_s(_bridged(motion, from_s, motion.end_s + 0.03, std)) for from_s, std in spans]
+    assert found[0] == pytest.approx(0.1, rel=0.02)
+    assert found[1] == pytest.approx(0.1 / np.sqrt(2), rel=0.05)
+    assert found[2:] == [0.0, 0.0]
 
 
-def test_an_uncertain_rate_adds_to_what_neighbours_leave() -> None:
-    """Covariances add."""
-    motion = TurningCamera(phone()).motion
-    bridge = Field("rate", ("time",), ((motion.start_s - 1, motion.end_s + 1),), ((0.0,) * 3,) * 2, ((0.1,) * 3,) * 2)
-    bridged = replace(motion, profile=motion.profile.with_extensions(field=(bridge,)))
-    found = with_uncertain_rates(RefinedMotion(bridged, 0.02 * np.eye(3), 5.0), bridged)
-    assert found is not None
-    np.testing.assert_allclose(found.rate_covariance, 0.03 * np.eye(3), atol=1e-12)
-    assert found.scatter_px_s == 5.0
+def test_what_a_bridge_leaves_open_adds_to_the_missing_rotation() -> None:
+    """Variances add."""
+    usual = MissingTurn(0.03, 0.02, 0.01, 5.0, 12)
+    found = usual.beside(0.04)
+    assert (found.rate_rad_s, found.rest_rad_s) == pytest.approx((0.05, np.sqrt(0.002)))
+    assert found.bend_rad_s == pytest.approx(np.hypot(0.01, HALF_SPACING * 0.04))
+    assert (found.scatter_px_s, found.pairs) == (5.0, 12)
 
 
 @pytest.mark.parametrize("missing_rad_s", [0.0, 0.001, 0.003])

@@ -88,6 +88,12 @@ class MissingTurn:
     """Number of pairs."""
     following: FollowingTurn = FollowingTurn()
 
+    def beside(self, rate_rad_s: float) -> MissingTurn:
+        """With a further missing rate of this standard deviation per axis, independent from interval to interval."""
+        rate, rest = (float(np.hypot(own, rate_rad_s)) for own in (self.rate_rad_s, self.rest_rad_s))
+        bend = float(np.hypot(self.bend_rad_s, HALF_SPACING * rate_rad_s))
+        return replace(self, rate_rad_s=rate, rest_rad_s=rest, bend_rad_s=bend)
+
     def refined(
         self,
         motion: RowMotion,
@@ -165,21 +171,18 @@ class RefinedMotion:
         return float(per_exposure_px * _rms_from_reference_s(self.motion) / exposure_s)
 
 
-def with_uncertain_rates(refined: RefinedMotion | None, motion: RowMotion) -> RefinedMotion | None:
-    """A frame's motion with the uncertainty of the profile's fields of the rate over time, averaged over its rows.
+def uncertain_rate_rad_s(motion: RowMotion) -> float:
+    """Standard deviation of the profile's fields of the rate over time, rms over a frame; of its most uncertain axis.
 
     Such a field bridges a stretch of the log; one that the frame's exposures do not reach adds nothing.  The error is
-    taken to last for the exposure, since a bridge's knots are about as far apart.
+    taken to last for the exposure, since a bridge's knots are about as far apart.  0 if its harm is negligible.
     """
-    profile, time_s, variance = motion.profile, np.linspace(motion.start_s, motion.end_s, RATE_STEPS), np.zeros(3)
-    for field in profile.over_time("rate"):
+    time_s, variance = np.linspace(motion.start_s, motion.end_s, RATE_STEPS), np.zeros(3)
+    for field in motion.profile.over_time("rate"):
         if field.std and field.knots[0][0] < motion.end_s and field.knots[0][-1] > motion.start_s:
             variance += np.mean(field.std_over_time(time_s) ** 2, axis=0)
-    if not variance.any():
-        return refined
-    refined = refined or RefinedMotion(motion, np.zeros((3, 3)), 0.0)
-    of_camera = profile.rotation_cam_imu * variance @ profile.rotation_cam_imu.T
-    return replace(refined, rate_covariance=refined.rate_covariance + of_camera)
+    std_rad_s = float(np.sqrt(variance.max()))
+    return std_rad_s if _harm_px(motion, std_rad_s) > NEGLIGIBLE_PX else 0.0
 
 
 def missing_turn(

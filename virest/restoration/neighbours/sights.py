@@ -38,7 +38,7 @@ from virest.restoration.neighbours.joint import (
 )
 from virest.restoration.neighbours.own_motion import moves_on_its_own
 from virest.restoration.neighbours.reduced_tiles import reduced, reduced_light
-from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion
+from virest.restoration.neighbours.refinement import MissingTurn, RefinedMotion, uncertain_rate_rad_s, unmeasured_turn
 from virest.restoration.neighbours.registration import (
     FrameTiles,
     PairTurn,
@@ -119,16 +119,19 @@ class FrameNeighbours:
         self._turns: dict[int, PairTurn | None] = {}
 
     def refined(self, before: Sequence[Sight], here: Sight, after: Sequence[Sight]) -> RefinedMotion | None:
-        """The frame's motion refined by its neighbours; None if the capture lacks no rotation.
+        """The frame's motion refined by its neighbours; None if it lacks no rotation, and its rates are certain.
 
         Pairs that are not consecutive in the movie are not used.
         """
         assert here.motion is not None
         self._forget_before(here.frame.index - max(len(before), 1))
-        if self._missing is None:
+        missing, uncertain_rad_s = self._missing, uncertain_rate_rad_s(here.motion)
+        if uncertain_rad_s:
+            missing = unmeasured_turn(uncertain_rad_s) if missing is None else missing.beside(uncertain_rad_s)
+        if missing is None:
             return None
         turns = [self.turn(first, second) for first, second in pairwise((*before, here, *after))]
-        return self._missing.refined(here.motion, turns[: len(before)][::-1], turns[len(before) :], self._trajectory)
+        return missing.refined(here.motion, turns[: len(before)][::-1], turns[len(before) :], self._trajectory)
 
     def checked(
         self,
