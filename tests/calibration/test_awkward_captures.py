@@ -190,3 +190,38 @@ def test_a_wide_lens_is_found_while_the_camera_sways_before_a_wall() -> None:
     assert found.profile.intrinsics.coefficients[:2] == pytest.approx((-0.22, 0.07), abs=0.004)
     assert found.profile.time_offset_s == pytest.approx(setup.time_offset_s, abs=2e-4)
     assert found.residual_px < 1.2 * setup.noise_px
+
+
+@pytest.mark.parametrize("fault", ["clipped", "filled gap"])
+def test_wrong_stretches_of_the_log_do_not_bias_the_calibration(fault: str) -> None:
+    """Their pairs and the path from the accelerometer are not used, a note says so, and no field is left behind."""
+
+    def gyro(time_s: np.ndarray, rate: np.ndarray, _force: np.ndarray) -> np.ndarray:
+        if fault == "clipped":
+            return np.clip(rate, -0.75, 0.75)
+        inside = (time_s > 1.0) & (time_s < 1.13)
+        filled = rate.copy()
+        ends_s = [time_s[~inside & (time_s <= 1.0)][-1], time_s[~inside & (time_s >= 1.13)][0]]
+        for axis in range(3):
+            filled[inside, axis] = np.interp(time_s[inside], ends_s, np.interp(ends_s, time_s, rate[:, axis]))
+        return filled
+
+    setup = Setup(
+        seed=93, frames=75, width=480, height=360, points=70, focal_px=400.0, rate_rad_s=0.9, noise_px=0.06,
+        plane_per_m=(0.0, 0.0, 0.33), sway_m=0.03, readout_direction="top_to_bottom", exposure_swing=0.0,
+    )  # fmt: skip
+    phone = StrangePhone(setup, Strange(gyro=gyro))
+    plain = replace(phone.profile, time_offset_s=0.0, gyro_bias_rad_s=(0.0, 0.0, 0.0), depth_m=None)
+    found = calibrate_geometry(phone.capture, plain, phone.pairs)
+    assert any(fault.split()[0].replace("filled", "interpolated") in note for note in found.notes)
+    assert not found.profile.fields
+    truth = {
+        "time_offset_s": setup.time_offset_s,
+        "readout_time_s": phone.profile.shutter.readout_time_s,
+        "gyro_bias_rad_s": setup.gyro_bias_rad_s,
+    }
+    values = {value.name: value for value in found.values if value.name in truth}
+    assert values.keys() == truth.keys()
+    for name, value in values.items():
+        assert value.determined or name == "gyro_bias_rad_s"
+        assert np.all(np.abs(np.subtract(value.value, truth[name])) < LARGEST_SIGMA * np.array(value.std))

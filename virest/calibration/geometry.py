@@ -44,7 +44,9 @@ from virest.inference.chance import student_tail
 from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.coded_motion import coding_bias_px
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
+from virest.inference.doubtful_log import Stretch, doubtful_stretches, doubts
 from virest.inference.even_blur import even_guide, is_blurred
+from virest.inference.log_bridges import touching, with_expected_rates
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
@@ -136,6 +138,16 @@ def calibrate_geometry(
     frames that do not follow the gyroscope.
     """
     report = progress or (lambda _: None)
+    bridged = with_expected_rates(profile, capture.imu, capture.stamp_0_ns)
+    if bridged is not profile:
+        # beyond a stretch the direction of gravity, and so the path from the accelerometer, is uncertain
+        gyro = replace(capture.imu, accel_m_s2=np.full_like(capture.imu.accel_m_s2, np.nan))
+        found = calibrate_geometry(replace(capture, imu=gyro), bridged, pairs, extra, progress, track_again)
+        of_phone = found.profile.with_fields(profile.fields)  # bridges hold for this log alone
+        unused = "pairs of frames there, and the accelerometer, are not used"
+        notes = tuple(f"{text}: {unused}" for text in doubts(capture.imu, profile))
+        return replace(found, profile=of_phone, notes=(*notes, *found.notes))
+    stretches = doubtful_stretches(capture.imu)
     observed = observe_tracks(capture, pairs, profile)
     lag = None
     if FRAME_LAG in extra and len(observed.pairs) >= MIN_PAIRS:
@@ -143,7 +155,7 @@ def calibrate_geometry(
         observed = _at_true_times(capture, observed, lag)
     names = list(dict.fromkeys([*extra, *(["focal"] if profile.intrinsics is None else [])]))
     whole, coarse, start = _started(observed, capture.imu, profile, names)
-    observed = whole.covered(capture.imu, start)
+    observed = _covered(whole, capture.imu, start, stretches)
     if len(observed.pairs) < MIN_PAIRS:
         raise CalibrationError(f"{len(observed.pairs)} pairs of frames lie inside the inertial data")
     report("coarse")
@@ -160,7 +172,7 @@ def calibrate_geometry(
             near = replace(rough, profile=_skewed(joint.fit.profile, drift, float(np.mean(joint.fit.seconds))))
         else:  # the first fit may be far off: search for offset and skew again
             whole, again, begun = _started(whole, capture.imu, profile, with_skew)
-            observed = whole.covered(capture.imu, begun)
+            observed = _covered(whole, capture.imu, begun, stretches)
             near = _readout_axis(capture.imu, observed.table(FEW_POINTS), begun, with_skew)
         drifting = _fit_jointly(capture.imu, observed, near, with_skew)
         skewed = _conclude(capture.imu, profile, begun, again, near, drifting)
@@ -169,7 +181,8 @@ def calibrate_geometry(
     explained = joint.corrected and joint.fit.scale < EXPLAINED_SCALE
     if track_again is not None and explained and is_blurred(joint.fit, joint.table):
         even = observe_tracks(capture, track_again(even_guide(capture, joint.fit, joint.table)), profile)
-        even = (even if lag is None else _at_true_times(capture, even, lag)).covered(capture.imu, start)
+        even = even if lag is None else _at_true_times(capture, even, lag)
+        even = _covered(even, capture.imu, start, stretches)
         if len(even.pairs) >= MIN_PAIRS:
             fitted = replace(rough, profile=joint.fit.profile, scene=joint.fit.scene)
             joint = _fit_jointly(capture.imu, even, fitted, names, even_blur=True)
@@ -217,6 +230,15 @@ def _drift_note(found: GeometryCalibration, given_skew: float) -> str:
     span_ms, skew = 1e3 * float(np.ptp(found.fit.seconds)), found.profile.clock_skew - given_skew
     drift_ms, std_ms = span_ms * skew, span_ms * _skew_std(found)
     return f"the clocks drift apart by {drift_ms:+.1f} ± {std_ms:.1f} ms over the capture: clock-skew was fitted too"
+
+
+def _covered(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, stretches: Sequence[Stretch]
+) -> ObservedTracks:
+    """The pairs within the log by a profile's clocks, without those in its doubtful stretches unless few remain."""
+    observed = observed.covered(imu, profile)
+    trusted = observed.chosen(~touching(observed, stretches, (1 + profile.clock_skew, profile.time_offset_s or 0.0)))
+    return trusted if len(trusted.pairs) >= MIN_PAIRS else observed
 
 
 def _at_true_times(capture: Capture, observed: ObservedTracks, lag: StartUpLag) -> ObservedTracks:

@@ -7,16 +7,17 @@ and is as uncertain as the motion of the hand makes it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from virest.arrays import Array
+from virest.arrays import Array, Mask
 from virest.camera.field import Field
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.inference.doubtful_log import CONTRADICTED, Stretch, doubtful_stretches
+from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.untrusted_rates import rates_given_log
 
 KNOT_STEP_S = 0.015
@@ -61,3 +62,15 @@ def with_expected_rates(profile: CameraProfile, imu: ImuSamples, stamp_0_ns: int
         return profile
     bridges = [expected_bridge(imu, stretch, stretches, stamp_0_ns).field for stretch in missing]
     return profile.with_fields([*profile.fields, *bridges])
+
+
+def touching(observed: ObservedTracks, stretches: Iterable[Stretch], to_imu: tuple[float, float]) -> Mask:
+    """Which pairs (pairs,) overlap an interval; to_imu: clock rate and offset from the camera's stamps to the log."""
+    rate, offset_s = to_imu
+    span = 0.05 + float(observed.exposure_s.max(initial=0.0))
+    begin = np.array([observed.stamp_s[pair.first] for pair in observed.pairs]) * rate + offset_s
+    end = np.array([observed.stamp_s[pair.second] for pair in observed.pairs]) * rate + offset_s + span
+    hit = np.zeros(len(observed.pairs), bool)
+    for stretch in stretches:
+        hit |= (begin < stretch.to_s) & (end > stretch.from_s)
+    return hit

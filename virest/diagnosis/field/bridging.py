@@ -18,13 +18,14 @@ from virest.capture.records import Capture
 from virest.diagnosis.cross_validation import JUDGE_POINTS
 from virest.diagnosis.field.forms import FieldForm
 from virest.diagnosis.field.records import Distrusted
-from virest.diagnosis.field.stretches import bridging_form, touching
+from virest.diagnosis.field.stretches import bridging_form
 from virest.diagnosis.geometric_evidence import Evidence, Model, capped_rms, fit_model, make_evidence
 from virest.diagnosis.geometric_ladder import FINAL_POINTS, GeometricVerdict
 from virest.image_formation.point_model import TrackTable, integrate_motion
 from virest.inference.chance import chance_of_larger
 from virest.inference.comparable_noise import noise_distances
 from virest.inference.doubtful_log import CONTRADICTED, Stretch, doubtful_stretches
+from virest.inference.log_bridges import touching
 from virest.inference.observed_tracks import ObservedTracks
 from virest.inference.track_fit import Term, TrackFit, for_table, start_scene
 from virest.motion.scene_motion import InertialMotion

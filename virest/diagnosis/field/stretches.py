@@ -9,28 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-import numpy as np
 from scipy.linalg import block_diag
 
-from virest.arrays import Mask
 from virest.camera.field import AXES
 from virest.capture.imu import ImuSamples
 from virest.diagnosis.field.forms import FieldForm
 from virest.inference.doubtful_log import Stretch
 from virest.inference.log_bridges import expected_bridge
-from virest.inference.observed_tracks import ObservedTracks
-
-
-def touching(observed: ObservedTracks, stretches: Iterable[Stretch], to_imu: tuple[float, float]) -> Mask:
-    """Which pairs (pairs,) overlap an interval; to_imu: clock rate and offset from the camera's stamps to the log."""
-    rate, offset_s = to_imu
-    span = 0.05 + float(observed.exposure_s.max(initial=0.0))
-    begin = np.array([observed.stamp_s[pair.first] for pair in observed.pairs]) * rate + offset_s
-    end = np.array([observed.stamp_s[pair.second] for pair in observed.pairs]) * rate + offset_s + span
-    hit = np.zeros(len(observed.pairs), bool)
-    for stretch in stretches:
-        hit |= (begin < stretch.to_s) & (end > stretch.from_s)
-    return hit
 
 
 def bridging_form(stretches: Sequence[Stretch], stamp_0_ns: int, imu: ImuSamples) -> FieldForm:
