@@ -13,7 +13,7 @@ from motion.synthetic_tracks import Recording, Setup
 from virest.camera.gyro_filter import delay_s
 from virest.camera.profile import CameraProfile, Extensions
 from virest.diagnosis import candidates
-from virest.diagnosis.candidates import SCREEN_POINTS, Candidate
+from virest.diagnosis.candidates import SCREEN_POINTS, Candidate, FarStart
 from virest.diagnosis.cross_validation import Judged, judge, screen
 from virest.diagnosis.findings import Finding, ParameterChange
 from virest.diagnosis.geometric_effects import GEOMETRIC_EFFECTS
@@ -29,7 +29,7 @@ from virest.diagnosis.geometric_evidence import (
     make_evidence,
 )
 from virest.diagnosis.geometric_findings import findings_of
-from virest.diagnosis.geometric_ladder import _is_simpler, climb
+from virest.diagnosis.geometric_ladder import SearchContext, _is_simpler, climb
 from virest.diagnosis.geometric_verdict import GeometricVerdict
 from virest.effects.changes import rotation_between
 from virest.inference import profile_terms as terms_of
@@ -385,6 +385,21 @@ def test_a_wrong_scene_depth_is_named() -> None:
     assert told.nominal == 2.9
     assert told.estimate == pytest.approx(wall_m(recording), rel=0.03)
     assert_explained(verdict, NEAR.noise_px)
+
+
+def test_beside_bridges_no_depth_is_sought() -> None:
+    """Beyond a bridged stretch of the log gravity is uncertain, and so is how far the camera travels."""
+    given, profile = evidence(NEAR), replace(recorded(NEAR).profile, depth_m=2.9)
+    model = Model(profile, base_scene(given, profile, given.table(Model(profile, None, ()), SCREEN_POINTS)), ())
+    plain = SearchContext(given, profile, (), FarStart(), one_by_one)
+    bridged = replace(plain, bridged=lambda model: model)
+    untrusted = replace(model, profile=replace(profile, imu_untrusted_s=((0.3, 0.4),)))
+    sought = [
+        {candidate.name for candidate in context.candidates(start, set())}
+        for context, start in ((plain, model), (bridged, model), (plain, untrusted))
+    ]
+    assert "scene_depth" in sought[0]
+    assert sought[1:] == [sought[0] - {"scene_depth"}] * 2
 
 
 def test_varying_exposures_determine_the_exposure_scale() -> None:

@@ -280,7 +280,12 @@ class SearchContext:
         return model if self.bridged is None else refitted(self.evidence, self.bridged(model), JUDGE_POINTS)[0]
 
     def candidates(self, model: Model, tried: set[str]) -> list[Candidate]:
-        """All causes that are not in a model yet."""
+        """All causes that are not in a model yet.
+
+        Beyond a bridge the direction of gravity is uncertain, so the path from the accelerometer tells no depth.
+        """
+        if self.bridged is not None or model.profile.imu_untrusted_s:
+            tried = tried | {"scene_depth"}
         found = candidates_of(self.evidence, self.nominal, model, tried, self.lags, self.far)
         found = [entry for entry in found if self.among is None or entry.name in self.among]
         return worth_beginning(self.evidence, model, found)
