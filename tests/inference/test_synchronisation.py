@@ -20,7 +20,14 @@ from virest.capture.imu import ImuSamples
 from virest.capture.records import Frame
 from virest.inference.frame_selection import choose_pairs
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
-from virest.inference.synchronisation import Agreement, OffsetEstimate, check_agreement, estimate_time_offset
+from virest.inference.synchronisation import (
+    RIGHT_ANGLES,
+    Agreement,
+    OffsetEstimate,
+    check_agreement,
+    estimate_time_offset,
+    shown_axes,
+)
 from virest.inference.tracking import track_pairs
 
 SWAYING = Hand(seed=31, frames=40, points=60, gyro_noise_rad_s=0.001)
@@ -75,6 +82,31 @@ def test_a_gyroscope_with_other_axes_is_reported() -> None:
     assert not told.agrees
     assert "virest calibrate finds them" in told.reason
     assert not estimate(Setup(hand_motion(3), frames=30, points=60)).other_axes
+
+
+@pytest.mark.parametrize("turn", [RIGHT_ANGLES[5], RIGHT_ANGLES[11], RIGHT_ANGLES[20]])
+def test_unstated_axes_are_those_that_the_frames_show(turn: NDArray[np.float64]) -> None:
+    """Default axes that are turned by right angles are turned back."""
+    recorded = make(Setup(hand_motion(3), time_offset_s=0.011, frames=30, points=60))
+    default = _turned(recorded.profile, turn)
+    shown = shown_axes(recorded.observed(default), recorded.imu, default)
+    assert shown is not None
+    assert shown.axes_known
+    np.testing.assert_allclose(shown.rotation_cam_imu, recorded.profile.rotation_cam_imu, atol=1e-12)
+
+
+def test_axes_are_not_found_from_a_rotation_about_one_axis() -> None:
+    """Axes that map the axis of rotation alike explain the frames equally well."""
+    motion = hand_motion(3)
+    recorded = make(Setup(replace(motion, amplitude_rad_s=motion.amplitude_rad_s * [1, 0, 0]), frames=30, points=60))
+    default = _turned(recorded.profile, RIGHT_ANGLES[5])
+    assert shown_axes(recorded.observed(default), recorded.imu, default) is None
+
+
+def _turned(profile: CameraProfile, turn: NDArray[np.float64]) -> CameraProfile:
+    """The profile of a phone whose axes and offset nothing states, with other axes."""
+    axes = tuple(map(tuple, (turn.T @ profile.rotation_cam_imu).tolist()))
+    return replace(profile, time_offset_s=None, axes_known=False, r_cam_imu=axes)
 
 
 @pytest.mark.parametrize(

@@ -106,3 +106,22 @@ def test_wrong_axes_are_named_and_frames_are_copied(virest, work: Path):
     assert {line["status"] for line in result.lines} == {"copied"}
     assert said(result, "axes are not the profile's")
     assert "virest calibrate" in result.stderr
+
+
+def test_axes_that_no_profile_states_are_found(virest, work: Path):
+    """A landscape movie of a phone held upright, without camera.yaml: restored nearly as with the true profile."""
+    config = work / "upright.yaml"
+    profile = yaml.safe_load((simulate(virest, work / "any", "--frames", 2) / "camera.yaml").read_text())
+    profile["image"] |= {"width": 320, "height": 240}
+    profile["intrinsics"] |= {"fx_px": 280.0, "fy_px": 280.0, "cx_px": 159.5, "cy_px": 119.5}
+    profile["imu"]["T_cam_imu"] = np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
+    config.write_text(yaml.safe_dump(profile))
+    size = ("--width", 320, "--height", 240, "--frames", 16)
+    capture = simulate(virest, work / "upright", *OPTIONS.split(), 29, *size, "--config", config)
+    stated = process(virest, capture, work / "upright-stated", "--preset", "fast")
+    (capture / "camera.yaml").unlink()
+    result = process(virest, capture, work / "upright-run", "--preset", "fast")
+    assert said(result, "axes are turned by 90° from the default ones")
+    found = np.array(result.account["profile"]["imu"]["T_cam_imu"])
+    np.testing.assert_allclose(found, profile["imu"]["T_cam_imu"], atol=0.03)
+    assert np.mean(psnrs_db(result, result, capture) - psnrs_db(stated, result, capture)) > -0.3

@@ -106,6 +106,8 @@ class CameraProfile:
     """False if the profile has ``readout_time_s: null``; the shutter then holds 0."""
     r_cam_imu: tuple[tuple[float, ...], ...] = ANDROID_R_CAM_IMU
     """Rotation, x_cam = r_cam_imu @ x_imu."""
+    axes_known: bool = True
+    """False if the rotation is a default that nothing states."""
     p_cam_imu_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Last column of T_cam_imu: the IMU's origin in camera axes, metres."""
     time_offset_s: float | None = None

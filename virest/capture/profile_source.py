@@ -50,6 +50,7 @@ def phone_profile(width: int, height: int, device: str = "", focal_length_mm: fl
         shutter=Shutter(0.0, "right_to_left" if portrait else "top_to_bottom"),
         readout_known=False,
         r_cam_imu=ANDROID_R_CAM_IMU if portrait else LANDSCAPE_R_CAM_IMU,
+        axes_known=False,
         focal_length_mm=focal_length_mm,
     )
 

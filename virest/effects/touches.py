@@ -35,7 +35,7 @@ OF_PROFILE = {
     **dict.fromkeys(("width", "height", "shutter", "readout_known", "time_offset_s", "clock_skew"), NOTHING),
     **dict.fromkeys(("response", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "depth_m"), NOTHING),
     **dict.fromkeys(("device", "estimates", "imu_untrusted_s", "imu_untrusted_stamp_0_ns", "lens_shape"), NOTHING),
-    "open_imu": NOTHING,
+    **dict.fromkeys(("open_imu", "axes_known"), NOTHING),
 }
 """Profile fields that do not invalidate everything."""
 OF_EXTENSIONS = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 
 import numpy as np
 
@@ -58,6 +59,17 @@ READINGS = (
     (-1.0, False, "with one axis reversed, or two swapped,"),
 )
 """Factor on the gyroscope's log that undoes a recorder's mistake, and whether the axes are then the profile's."""
+RIGHT_ANGLES = np.array(
+    [
+        np.diag(signs) @ np.eye(3)[list(order)]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+        if np.linalg.det(np.diag(signs) @ np.eye(3)[list(order)]) > 0
+    ]
+)
+"""(24, 3, 3) all rotations that turn axes into axes."""
+MOST_REMAINING = 0.5
+"""Axes are found if they leave less than this part of what the second best leave unexplained."""
 AGREEMENT_SLACK_S = 0.03
 """Smaller errors of the offset are left to calibration; they do not mean that frames and gyroscope disagree."""
 CLEARLY_BETTER = 30.0
@@ -266,6 +278,22 @@ def check_agreement(observed: ObservedTracks, imu: ImuSamples, profile: CameraPr
         hint = hint or "was the movie stabilised in the camera, or is it from another recording?"
     reason = f"the gyroscope explains {max(explained, 0.0):.0%} of the frames' rotation: {hint}"
     return Agreement(False, reason, explained=explained, best_offset_s=elsewhere)
+
+
+def shown_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile) -> CameraProfile | None:
+    """The profile with its axes turned by right angles, as the frames show: sensors are mounted along a phone's edges.
+
+    None if no such axes agree, or if others agree nearly as well, as with motion about one axis alone.
+    """
+    turns, own = observed.turns(profile), profile.rotation_cam_imu
+    turned = [replace(profile, r_cam_imu=tuple(map(tuple, (turn @ own).tolist()))) for turn in RIGHT_ANGLES]
+    tried = [align_coarsely(turns, imu, one, own_axes=True) for one in turned]
+    if None in tried:
+        return None
+    left = np.array([1 - one.explained for one in tried if one is not None])
+    best, second = np.argsort(left)[:2]
+    agree = 1 - left[best] >= MIN_EXPLAINED and left[best] < MOST_REMAINING * left[second]
+    return replace(turned[best], axes_known=True) if agree else None
 
 
 def _with_other_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float) -> str:

@@ -18,6 +18,7 @@ from virest.camera.shutter import STAMP_FRACTION
 from virest.capture.folder import GUESSED_FOCAL, Capture, Frame
 from virest.capture.frame_coding import FrameCoding
 from virest.capture.imu import ImuSamples
+from virest.effects.changes import rotation_between
 from virest.effects.table import EFFECTS
 from virest.image_formation.row_clock import RowClock
 from virest.image_formation.row_motion import FrameTranslation, RowMotion, frame_times_s
@@ -36,6 +37,7 @@ from virest.inference.synchronisation import (
     check_agreement,
     estimate_time_offset,
     refine_time_offset,
+    shown_axes,
 )
 from virest.inference.tracking import TrackPair, track_pairs
 from virest.inference.unsharp_mask import MOST_FRAMES
@@ -149,9 +151,11 @@ def _planned(
     all_pairs = track_pairs(store_powers(pictures, measured, curve, powers), guide=guide)
     tracked = [pair for pair in all_pairs if pair.first in chosen and pair.second in chosen]
     if profile.time_offset_s is None or profile.intrinsics is None:
-        plan = _with_estimates(plan, capture.imu, observe_tracks(capture, tracked, profile))
-    if plan.refuses(NoteCode.OTHER_AXES):
-        return plan
+        observed = observe_tracks(capture, tracked, profile)
+        plan = _with_estimates(plan, capture.imu, observed)
+        if plan.refuses(NoteCode.OTHER_AXES):
+            shown = None if profile.axes_known else shown_axes(observed, capture.imu, profile)
+            return plan if shown is None else _noted_axes(planned(capture, shown), profile)
     alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
@@ -567,6 +571,13 @@ def _with_estimates(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTr
     if estimate.std_s > MAX_OFFSET_STD_S and plan.refusal is None:
         return plan.refused(NoteCode.TIME_OFFSET, f"time offset only known to ± {estimate.std_s * 1e3:.1f} ms")
     return plan
+
+
+def _noted_axes(plan: RestorationPlan, given: CameraProfile) -> RestorationPlan:
+    """The plan with a note on the axes that are not the default ones."""
+    angle = np.degrees(np.linalg.norm(rotation_between(given, plan.profile)))
+    text = f"the gyroscope's axes are turned by {angle:.0f}° from the default ones, as tracked points show"
+    return plan.noted(NoteCode.DEFAULT_TAKEN, text)
 
 
 def _with_bias(profile: CameraProfile, estimate: OffsetEstimate) -> CameraProfile:
