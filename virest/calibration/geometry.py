@@ -50,7 +50,7 @@ from virest.inference.log_bridges import touching, with_expected_rates
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
-from virest.inference.synchronisation import DRIFT_P, other_reading
+from virest.inference.synchronisation import DIRECTION_COST, DRIFT_P, other_reading
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import Guide, TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
@@ -66,8 +66,6 @@ EXPLAINED_SCALE = 1.15
 """Whitened residuals with a scale below this need no translation."""
 TRANSLATION_GAIN = 0.97
 """A translation is kept if it reduces the residual scale below this fraction."""
-DIRECTION_COST = 12.0
-"""Minimum cost difference, in squared residual scales, between readouts along rows and along columns."""
 OUTLIER_WEIGHT, MANY_OUTLIERS = 0.1, 0.1
 """Tracks below this Cauchy weight (7.2 σ) do not follow the camera; a larger part of them is noted."""
 EXCLUSION_PASSES = 3

@@ -17,7 +17,8 @@ from virest.arrays import Array
 from virest.camera.profile import CameraProfile
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
-from virest.inference.chance import student_tail
+from virest.image_formation.row_clock import as_global_shutter, right_way_round
+from virest.inference.chance import chi2_tail, student_tail
 from virest.inference.coarse_alignment import MIN_EXPLAINED, MIN_MOTION_PX, MIN_PAIRS, SEARCH_S, STEP_S, align_coarsely
 from virest.inference.frame_rotations import FrameRotations, gyro_turns
 from virest.inference.observed_tracks import MIN_TRACKS, ObservedTracks
@@ -70,6 +71,10 @@ RIGHT_ANGLES = np.array(
 """(24, 3, 3) all rotations that turn axes into axes."""
 MOST_REMAINING = 0.5
 """Axes are found if they leave less than this part of what the second best leave unexplained."""
+DIRECTION_COST = 12.0
+"""Minimum cost difference, in squared residual scales, between readouts along rows and along columns."""
+READOUT_P = 1e-5
+"""Significance level of a readout time that no profile states."""
 AGREEMENT_SLACK_S = 0.03
 """Smaller errors of the offset are left to calibration; they do not mean that frames and gyroscope disagree."""
 CLEARLY_BETTER = 30.0
@@ -294,6 +299,35 @@ def shown_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile
     best, second = np.argsort(left)[:2]
     agree = 1 - left[best] >= MIN_EXPLAINED and left[best] < MOST_REMAINING * left[second]
     return replace(turned[best], axes_known=True) if agree else None
+
+
+def shown_readout(
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, *, offset_known: bool
+) -> CameraProfile | None:
+    """The profile with the readout time, with its deviation, and the direction that the points show.
+
+    The readout takes either sign along rows or columns; the middle row keeps its time.  None where the points do not
+    tell these apart, or show no readout, or one that takes longer than a frame.
+    """
+    observed = observed.covered(imu, profile)
+    if len(observed.pairs) < MIN_PAIRS:
+        return None
+    table, noise_px = observed.table(POINTS), float(np.median(observed.noise_px))
+    terms = careful_terms(replace(profile, readout_known=False), offset_known=offset_known, focal_known=True)
+    fits = [
+        _simplest(imu, table, as_global_shutter(profile, direction), terms)
+        for direction in ("top_to_bottom", "left_to_right")
+    ]
+    best, other = sorted(fits, key=lambda fit: fit.cost)
+    std_s = float(np.hypot(best.std("readout_time")[0], bias_std(best, "readout_time", noise_px)[0]))
+    found = right_way_round(best.profile)
+    readout_s, period_s = found.shutter.readout_time_s, float(np.median(table.second_stamp_s - table.first_stamp_s))
+    clear = other.cost - best.cost > DIRECTION_COST * best.scale**2
+    if not clear or readout_s > period_s or chi2_tail((readout_s / std_s) ** 2, 1) >= READOUT_P:
+        return None
+    shutter = replace(profile.shutter, readout_time_s=readout_s, readout_direction=found.shutter.readout_direction)
+    source = "tracked points against the gyroscope"
+    return profile.with_estimate("readout_time_s", readout_s, std_s, source, shutter=shutter, readout_known=True)
 
 
 def _with_other_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float) -> str:

@@ -38,6 +38,7 @@ from virest.inference.synchronisation import (
     estimate_time_offset,
     refine_time_offset,
     shown_axes,
+    shown_readout,
 )
 from virest.inference.tracking import TrackPair, track_pairs
 from virest.inference.unsharp_mask import MOST_FRAMES
@@ -156,6 +157,16 @@ def _planned(
         if plan.refuses(NoteCode.OTHER_AXES):
             shown = None if profile.axes_known else shown_axes(observed, capture.imu, profile)
             return plan if shown is None else _noted_axes(planned(capture, shown), profile)
+
+    def with_readout(plan: RestorationPlan) -> RestorationPlan | None:
+        if profile.readout_known or plan.profile.intrinsics is None:
+            return None
+        observed, offset_known = observe_tracks(capture, tracked, plan.profile), profile.time_offset_s is not None
+        shutter = shown_readout(observed, capture.imu, plan.profile, offset_known=offset_known)
+        return None if shutter is None else _noted_readout(planned(capture, _with_readout(profile, shutter)), shutter)
+
+    if (read := with_readout(plan)) is not None:
+        return read
     alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
@@ -167,6 +178,8 @@ def _planned(
             alignment = _aligned(settled.profile, profile, capture, all_pairs)
             settled = _with_clock(settled, profile, alignment)
         plan = settled
+    if plan.profile.intrinsics != profile.intrinsics and (read := with_readout(plan)) is not None:
+        return read  # with a lens that was found first
     if plan.refusal is None:
         times = find_frame_times(plan, profile, capture, tracked, lambda n: track_pairs(read_gray(n), guide=guide))
         retimed = None if times is None else _retimed(plan, times, capture, powers, planned)
@@ -578,6 +591,21 @@ def _noted_axes(plan: RestorationPlan, given: CameraProfile) -> RestorationPlan:
     angle = np.degrees(np.linalg.norm(rotation_between(given, plan.profile)))
     text = f"the gyroscope's axes are turned by {angle:.0f}° from the default ones, as tracked points show"
     return plan.noted(NoteCode.DEFAULT_TAKEN, text)
+
+
+def _with_readout(profile: CameraProfile, shown: CameraProfile) -> CameraProfile:
+    """The profile with another's shutter and its estimate; where the offset is known, the first row keeps its time."""
+    estimate = shown.estimates["readout_time_s"]
+    return profile.with_estimate(
+        "readout_time_s", estimate.value, estimate.std, estimate.source, shutter=shown.shutter, readout_known=True
+    )
+
+
+def _noted_readout(plan: RestorationPlan, shown: CameraProfile) -> RestorationPlan:
+    estimate = shown.estimates["readout_time_s"]
+    std_ms = 1e3 * float(np.max(np.asarray(estimate.std, float)))
+    readout_ms, direction = 1e3 * shown.shutter.readout_time_s, shown.shutter.readout_direction
+    return plan.noted(NoteCode.READOUT, f"readout time estimated: {readout_ms:.2f} ± {std_ms:.2f} ms, {direction}")
 
 
 def _with_bias(profile: CameraProfile, estimate: OffsetEstimate) -> CameraProfile:

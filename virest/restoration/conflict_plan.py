@@ -92,7 +92,10 @@ def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
     if found.focal is not None:
         if found.focal[1] > MAX_FOCAL_SPREAD * found.focal[0]:
             return plan
-        profile = replace(profile, intrinsics=None).with_focal(*found.focal, OFFSET_SOURCE)
+        lens = profile.intrinsics
+        assert lens is not None
+        lens = lens.scaled_focal(found.focal[0] / lens.fx_px)
+        profile = profile.with_estimate("fx_px", *found.focal, OFFSET_SOURCE, intrinsics=lens)
     profile = profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
     plan = replace(plan.without(NoteCode.TIME_OFFSET), profile=profile, refusal=None)
     if std_s > MAX_OFFSET_STD_S:

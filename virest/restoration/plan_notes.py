@@ -21,6 +21,8 @@ class NoteCode(Enum):
     """The gyroscope explains the rotation with other axes than the profile's."""
     OTHER_OFFSET = auto()
     """The frames contradict a stated offset, and theirs is used."""
+    READOUT = auto()
+    """The readout, missing in the profile, was estimated."""
     FOCAL_LENGTH = auto()
     """The focal length, missing in the profile, could not be estimated."""
     BLUR_LENGTH = auto()
