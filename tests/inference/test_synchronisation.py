@@ -27,6 +27,7 @@ from virest.inference.synchronisation import (
     check_agreement,
     estimate_time_offset,
     shown_axes,
+    shown_readout,
 )
 from virest.inference.tracking import track_pairs
 
@@ -101,6 +102,26 @@ def test_axes_are_not_found_from_a_rotation_about_one_axis() -> None:
     recorded = make(Setup(replace(motion, amplitude_rad_s=motion.amplitude_rad_s * [1, 0, 0]), frames=30, points=60))
     default = _turned(recorded.profile, RIGHT_ANGLES[5])
     assert shown_axes(recorded.observed(default), recorded.imu, default) is None
+
+
+@pytest.mark.parametrize("direction", [*DIRECTIONS, "at once"])
+def test_an_unstated_readout_is_that_which_the_points_show(direction: str) -> None:
+    """Its axis, sign and time, whatever direction is assumed; a global shutter has none."""
+    read = {"readout_time_s": 0.0} if direction == "at once" else {"readout_direction": direction}
+    recorded = make(Setup(hand_motion(3), time_offset_s=0.011, frames=30, points=60, **read))  # type: ignore[arg-type]
+    shutter = replace(recorded.profile.shutter, readout_time_s=0.0, readout_direction="left_to_right")
+    unknown = replace(recorded.profile, time_offset_s=0.02, readout_known=False, shutter=shutter)
+    known = {"offset_known": False, "focal_known": direction != "top_to_bottom"}
+    shown = shown_readout(recorded.observed(unknown), recorded.imu, unknown, **known)
+    if direction == "at once":
+        assert shown is None
+        return
+    assert shown is not None
+    assert shown.readout_known
+    assert shown.shutter.readout_direction == direction
+    estimate = shown.estimates["readout_time_s"]
+    assert estimate.value == pytest.approx(0.0207, abs=2e-4)
+    assert abs(shown.shutter.readout_time_s - 0.0207) < 4 * float(np.max(np.asarray(estimate.std, float)))
 
 
 def _turned(profile: CameraProfile, turn: NDArray[np.float64]) -> CameraProfile:

@@ -10,7 +10,10 @@ from motion.synthetic_tracks import Recording, Setup, recorded
 
 from virest.camera.profile import CameraProfile, Extensions
 from virest.image_formation.row_clock import right_way_round
+from virest.restoration.capture import RestorationPlan
+from virest.restoration.conflict_plan import _with_open_values
 from virest.restoration.profile_conflict import Settled, settle_conflict
+from virest.restoration.settings import RestorationSettings
 
 HAND = Setup(seed=71, frames=26, points=40, gyro_noise_rad_s=0.002)
 
@@ -207,3 +210,17 @@ def test_an_unexplained_conflict_changes_nothing() -> None:
     found = settle_conflict(recording.observed, stranger.imu, recording.profile, offset_known=True)
     assert found.contradicted
     assert found.profile is recording.profile
+
+
+def test_a_lens_found_beside_an_unknown_focal_length_is_kept() -> None:
+    """The focal length is that of the points, and the distortion stays."""
+    profile = replace(recorded(Setup(seed=3, frames=6)).profile, time_offset_s=None)
+    lens = profile.intrinsics
+    assert lens is not None
+    bent = replace(profile, intrinsics=replace(lens, model="radtan", coefficients=(-0.2, 0.05, 0.0, 0.0, 0.0)))
+    found = Settled(bent, True, ("k1 of -0.2 is used",), 2.0, 0.1, 0.1, (0.004, 1e-4), 10.0, (410.0, 1.5))
+    plan = _with_open_values(RestorationPlan(replace(profile, intrinsics=None), RestorationSettings()), found)
+    assert plan.profile.intrinsics is not None
+    assert plan.profile.intrinsics.coefficients == (-0.2, 0.05, 0.0, 0.0, 0.0)
+    assert plan.profile.intrinsics.fx_px == pytest.approx(410.0)
+    assert plan.profile.estimates["fx_px"].std == 1.5

@@ -302,18 +302,20 @@ def shown_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile
 
 
 def shown_readout(
-    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, *, offset_known: bool
+    observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, *, offset_known: bool, focal_known: bool
 ) -> CameraProfile | None:
     """The profile with the readout time, with its deviation, and the direction that the points show.
 
-    The readout takes either sign along rows or columns; the middle row keeps its time.  None where the points do not
+    The readout takes either sign along rows or columns; the middle row keeps its time.  offset_known, focal_known:
+    whether these are stated; otherwise they are fitted too.  None where the points do not
     tell these apart, or show no readout, or one that takes longer than a frame.
     """
     observed = observed.covered(imu, profile)
     if len(observed.pairs) < MIN_PAIRS:
         return None
     table, noise_px = observed.table(POINTS), float(np.median(observed.noise_px))
-    terms = careful_terms(replace(profile, readout_known=False), offset_known=offset_known, focal_known=True)
+    unknown = replace(profile, readout_known=False)
+    terms = careful_terms(unknown, offset_known=offset_known, focal_known=focal_known)
     fits = [
         _simplest(imu, table, as_global_shutter(profile, direction), terms)
         for direction in ("top_to_bottom", "left_to_right")

@@ -161,8 +161,9 @@ def _planned(
     def with_readout(plan: RestorationPlan) -> RestorationPlan | None:
         if profile.readout_known or plan.profile.intrinsics is None:
             return None
-        observed, offset_known = observe_tracks(capture, tracked, plan.profile), profile.time_offset_s is not None
-        shutter = shown_readout(observed, capture.imu, plan.profile, offset_known=offset_known)
+        observed = observe_tracks(capture, tracked, plan.profile)
+        known = {"offset_known": profile.time_offset_s is not None, "focal_known": profile.intrinsics is not None}
+        shutter = shown_readout(observed, capture.imu, plan.profile, **known)
         return None if shutter is None else _noted_readout(planned(capture, _with_readout(profile, shutter)), shutter)
 
     if (read := with_readout(plan)) is not None:
