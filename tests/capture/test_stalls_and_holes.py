@@ -46,11 +46,9 @@ def test_repeats_long_after_the_start_are_a_stall(tmp_path):
     assert as_json(capture)["stalls"] == [[74, 83]]
 
 
-@pytest.mark.parametrize("repeat", [59, 60, 61])
-def test_a_repeat_at_the_end_of_the_start_up_is_seen(tmp_path, repeat):
+def test_a_repeat_at_the_end_of_the_start_up_is_seen(tmp_path):
     """The start-up is 2 s; the first frame after it is compared with the last one in it."""
-    capture = read_capture(CaptureWriter(tmp_path / "c", count=110, repeats=(repeat,)).write())
-    assert repeat in capture.repeats or (repeat - 6, repeat) in capture.stalls
+    assert read_capture(CaptureWriter(tmp_path / "c", count=110, repeats=(60, 62)).write()).stalls == ((54, 62),)
 
 
 def test_a_phone_at_rest_repeats_without_a_stall(tmp_path):
