@@ -307,8 +307,8 @@ def shown_readout(
     """The profile with the readout time, with its deviation, and the direction that the points show.
 
     The readout takes either sign along rows or columns; the middle row keeps its time.  offset_known, focal_known:
-    whether these are stated; otherwise they are fitted too.  None where the points do not
-    tell these apart, or show no readout, or one that takes longer than a frame.
+    whether these are stated; otherwise they are fitted too.  None where the points do not tell the four directions
+    apart, or show no readout, or one that takes longer than a frame.
     """
     observed = observed.covered(imu, profile)
     if len(observed.pairs) < MIN_PAIRS:
