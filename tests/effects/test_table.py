@@ -56,6 +56,7 @@ OTHER: dict[str, Any] = {
     "intrinsics": of_lens,
     "shutter": lambda p: replace(p.shutter, readout_time_s=0.011, exposure_scale=1.3, timestamp="exposure_end"),
     "readout_known": lambda p: False,
+    "axes_known": lambda p: False,
     "r_cam_imu": lambda p: tuple(map(tuple, (TURN @ p.rotation_cam_imu).tolist())),
     "p_cam_imu_m": lambda p: (0.05, -0.03, 0.02),
     "time_offset_s": lambda p: p.time_offset_s + 0.004,
