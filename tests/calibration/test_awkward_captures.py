@@ -16,7 +16,7 @@ from motion.synthetic_tracks import Setup
 
 from virest.app.calibrate import find_calibration, plan_calibration
 from virest.app.simulate import simulate_command
-from virest.calibration.geometry import _is_significant, calibrate_geometry
+from virest.calibration.geometry import _divides_movie, _is_significant, calibrate_geometry
 from virest.camera.profile import CameraProfile
 from virest.camera.profile_file import read_profile, write_profile
 from virest.capture.video import GrayReader, probe_movie
@@ -192,28 +192,40 @@ def test_a_wide_lens_is_found_while_the_camera_sways_before_a_wall() -> None:
     assert found.residual_px < 1.2 * setup.noise_px
 
 
-@pytest.mark.parametrize("fault", ["clipped", "filled gap"])
-def test_wrong_stretches_of_the_log_do_not_bias_the_calibration(fault: str) -> None:
+def _filled(time_s: np.ndarray, rate: np.ndarray, _force: np.ndarray) -> np.ndarray:
+    """A log whose gap from 1 s to 1.13 s was filled with straight lines."""
+    inside = (time_s > 1.0) & (time_s < 1.13)
+    filled = rate.copy()
+    ends_s = [time_s[~inside & (time_s <= 1.0)][-1], time_s[~inside & (time_s >= 1.13)][0]]
+    for axis in range(3):
+        filled[inside, axis] = np.interp(time_s[inside], ends_s, np.interp(ends_s, time_s, rate[:, axis]))
+    return filled
+
+
+def _clipped(_time_s: np.ndarray, rate: np.ndarray, _force: np.ndarray) -> np.ndarray:
+    return np.clip(rate, -0.75, 0.75)
+
+
+def test_only_a_stretch_between_frames_makes_gravity_uncertain() -> None:
+    """The accelerometer is used where all frames were taken after the stretch, by clocks that are known."""
+    phone = StrangePhone(Setup(seed=93, frames=75, rate_rad_s=0.9), Strange(gyro=_filled))
+    later = replace(phone.capture, frames=phone.capture.frames[45:])
+    assert _divides_movie(phone.capture, phone.profile)
+    assert not _divides_movie(later, phone.profile)
+    assert _divides_movie(later, replace(phone.profile, time_offset_s=None))
+
+
+@pytest.mark.parametrize(("log", "named"), [(_clipped, "clipped"), (_filled, "interpolated")])
+def test_wrong_stretches_of_the_log_do_not_bias_the_calibration(log: Any, named: str) -> None:
     """Their pairs and the path from the accelerometer are not used, a note says so, and no field is left behind."""
-
-    def gyro(time_s: np.ndarray, rate: np.ndarray, _force: np.ndarray) -> np.ndarray:
-        if fault == "clipped":
-            return np.clip(rate, -0.75, 0.75)
-        inside = (time_s > 1.0) & (time_s < 1.13)
-        filled = rate.copy()
-        ends_s = [time_s[~inside & (time_s <= 1.0)][-1], time_s[~inside & (time_s >= 1.13)][0]]
-        for axis in range(3):
-            filled[inside, axis] = np.interp(time_s[inside], ends_s, np.interp(ends_s, time_s, rate[:, axis]))
-        return filled
-
     setup = Setup(
         seed=93, frames=75, width=480, height=360, points=70, focal_px=400.0, rate_rad_s=0.9, noise_px=0.06,
         plane_per_m=(0.0, 0.0, 0.33), sway_m=0.03, readout_direction="top_to_bottom", exposure_swing=0.0,
     )  # fmt: skip
-    phone = StrangePhone(setup, Strange(gyro=gyro))
+    phone = StrangePhone(setup, Strange(gyro=log))
     plain = replace(phone.profile, time_offset_s=0.0, gyro_bias_rad_s=(0.0, 0.0, 0.0), depth_m=None)
     found = calibrate_geometry(phone.capture, plain, phone.pairs)
-    assert any(fault.split()[0].replace("filled", "interpolated") in note for note in found.notes)
+    assert any(named in note for note in found.notes)
     assert not found.profile.fields
     truth = {
         "time_offset_s": setup.time_offset_s,

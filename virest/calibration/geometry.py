@@ -41,7 +41,7 @@ from virest.image_formation.row_clock import as_global_shutter, right_way_round
 from virest.inference import profile_terms as terms_of
 from virest.inference.blur_bias import LEFT_BY_EVEN_BLUR, RELATIVE_STD, blur_bias_px, rolling_shift_px
 from virest.inference.chance import student_tail
-from virest.inference.coarse_alignment import MIN_PAIRS, CoarseAlignment, align_coarsely, align_with_skew
+from virest.inference.coarse_alignment import MIN_PAIRS, SEARCH_S, CoarseAlignment, align_coarsely, align_with_skew
 from virest.inference.coded_motion import coding_bias_px
 from virest.inference.comparable_noise import residual_px, tracking_noise_px
 from virest.inference.doubtful_log import Stretch, doubtful_stretches, doubts
@@ -50,7 +50,7 @@ from virest.inference.log_bridges import touching, with_expected_rates
 from virest.inference.observed_tracks import ObservedTracks, observe_tracks
 from virest.inference.path_noise import path_errors_px
 from virest.inference.recorder_lag import StartUpLag, fit_start_up_lag
-from virest.inference.synchronisation import DIRECTION_COST, DRIFT_P, other_reading
+from virest.inference.synchronisation import AGREEMENT_SLACK_S, DIRECTION_COST, DRIFT_P, other_reading
 from virest.inference.track_fit import Term, TrackFit, fit_directed, fit_tracks, for_table, start_scene
 from virest.inference.tracking import Guide, TrackPair
 from virest.inference.tracking_bias import bias_std, remaining_std
@@ -138,11 +138,13 @@ def calibrate_geometry(
     report = progress or (lambda _: None)
     bridged = with_expected_rates(profile, capture.imu, capture.stamp_0_ns)
     if bridged is not profile:
-        # beyond a stretch the direction of gravity, and so the path from the accelerometer, is uncertain
-        gyro = replace(capture.imu, accel_m_s2=np.full_like(capture.imu.accel_m_s2, np.nan))
-        found = calibrate_geometry(replace(capture, imu=gyro), bridged, pairs, extra, progress, track_again)
+        unused = "pairs of frames there are not used"
+        if _divides_movie(capture, profile):
+            # beyond a stretch the direction of gravity, and so the path from the accelerometer, is uncertain
+            gyro = replace(capture.imu, accel_m_s2=np.full_like(capture.imu.accel_m_s2, np.nan))
+            capture, unused = replace(capture, imu=gyro), "pairs of frames there, and the accelerometer, are not used"
+        found = calibrate_geometry(capture, bridged, pairs, extra, progress, track_again)
         of_phone = found.profile.with_fields(profile.fields)  # bridges hold for this log alone
-        unused = "pairs of frames there, and the accelerometer, are not used"
         notes = tuple(f"{text}: {unused}" for text in doubts(capture.imu, profile))
         return replace(found, profile=of_phone, notes=(*notes, *found.notes))
     stretches = doubtful_stretches(capture.imu)
@@ -230,6 +232,14 @@ def _drift_note(found: GeometryCalibration, given_skew: float) -> str:
     return f"the clocks drift apart by {drift_ms:+.1f} ± {std_ms:.1f} ms over the capture: clock-skew was fitted too"
 
 
+def _divides_movie(capture: Capture, profile: CameraProfile) -> bool:
+    """Whether a doubtful stretch of the log may lie between two frames; an unknown offset may be SEARCH_S."""
+    slack_s = SEARCH_S if profile.time_offset_s is None else AGREEMENT_SLACK_S
+    time_s = np.asarray(profile.imu_time_s(np.array([frame.time_s for frame in capture.frames])))
+    first_s, last_s = float(np.nanmin(time_s)) - slack_s, float(np.nanmax(time_s)) + slack_s
+    return any(stretch.to_s > first_s and stretch.from_s < last_s for stretch in doubtful_stretches(capture.imu))
+
+
 def _covered(
     observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, stretches: Sequence[Stretch]
 ) -> ObservedTracks:
@@ -248,7 +258,8 @@ def _at_true_times(capture: Capture, observed: ObservedTracks, lag: StartUpLag) 
 
 
 def _with_lag(found: GeometryCalibration, lag: StartUpLag) -> GeometryCalibration:
-    profile = found.profile.with_extensions(frame_lag_s=lag.lag_s, frame_lag_frames=lag.frames)
+    frames = lag.frames if lag.lag_s else 0  # that a recording has no lag holds for no other
+    profile = found.profile.with_extensions(frame_lag_s=lag.lag_s, frame_lag_frames=frames)
     value = CalibratedValue("lag_s", 0.0, lag.lag_s, None, lag.determined, lag.note)
     return replace(found, profile=profile, values=(*found.values, value))
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from virest.arrays import Array
 from virest.camera.profile import CameraProfile
+from virest.camera.shutter import Shutter
 from virest.capture.imu import ImuSamples
 from virest.image_formation.point_model import TrackTable
 from virest.image_formation.row_clock import as_global_shutter, right_way_round
@@ -303,8 +304,8 @@ def shown_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile
 
 def shown_readout(
     observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, *, offset_known: bool, focal_known: bool
-) -> CameraProfile | None:
-    """The profile with the readout time, with its deviation, and the direction that the points show.
+) -> tuple[Shutter, float] | None:
+    """The profile's shutter with the readout time and direction that the points show, and the time's deviation.
 
     The readout takes either sign along rows or columns; the middle row keeps its time.  offset_known, focal_known:
     whether these are stated; otherwise they are fitted too.  None where the points do not tell the four directions
@@ -327,9 +328,8 @@ def shown_readout(
     clear = other.cost - best.cost > DIRECTION_COST * best.scale**2
     if not clear or readout_s > period_s or chi2_tail((readout_s / std_s) ** 2, 1) >= READOUT_P:
         return None
-    shutter = replace(profile.shutter, readout_time_s=readout_s, readout_direction=found.shutter.readout_direction)
-    source = "tracked points against the gyroscope"
-    return profile.with_estimate("readout_time_s", readout_s, std_s, source, shutter=shutter, readout_known=True)
+    direction = found.shutter.readout_direction
+    return replace(profile.shutter, readout_time_s=readout_s, readout_direction=direction), std_s
 
 
 def _with_other_axes(observed: ObservedTracks, imu: ImuSamples, profile: CameraProfile, search_s: float) -> str:

@@ -63,7 +63,7 @@ from virest.restoration.capture import (
 from virest.restoration.conflict_plan import (
     MAX_FOCAL_SPREAD,
     MAX_OFFSET_STD_S,
-    OFFSET_SOURCE,
+    POINTS_SOURCE,
     estimated_offset,
     explains_points,
     settle,
@@ -157,17 +157,9 @@ def _planned(
         if plan.refuses(NoteCode.OTHER_AXES):
             shown = None if profile.axes_known else shown_axes(observed, capture.imu, profile)
             return plan if shown is None else _noted_axes(planned(capture, shown), profile)
-
-    def with_readout(plan: RestorationPlan) -> RestorationPlan | None:
-        if profile.readout_known or plan.profile.intrinsics is None:
-            return None
-        observed = observe_tracks(capture, tracked, plan.profile)
-        known = {"offset_known": profile.time_offset_s is not None, "focal_known": profile.intrinsics is not None}
-        shutter = shown_readout(observed, capture.imu, plan.profile, **known)
-        return None if shutter is None else _noted_readout(planned(capture, _with_readout(profile, shutter)), shutter)
-
-    if (read := with_readout(plan)) is not None:
-        return read
+    lens = plan.profile.intrinsics
+    if (stated := _with_shown_readout(plan, profile, capture, tracked)) is not None:
+        return _noted_readout(planned(capture, stated))
     alignment, followed = None, False
     if runs and plan.profile.intrinsics is not None:
         alignment = _aligned(plan.profile, profile, capture, all_pairs)
@@ -179,8 +171,8 @@ def _planned(
             alignment = _aligned(settled.profile, profile, capture, all_pairs)
             settled = _with_clock(settled, profile, alignment)
         plan = settled
-    if plan.profile.intrinsics != profile.intrinsics and (read := with_readout(plan)) is not None:
-        return read  # with a lens that was found first
+    if plan.profile.intrinsics != lens and (stated := _with_shown_readout(plan, profile, capture, tracked)) is not None:
+        return _noted_readout(planned(capture, stated))
     if plan.refusal is None:
         times = find_frame_times(plan, profile, capture, tracked, lambda n: track_pairs(read_gray(n), guide=guide))
         retimed = None if times is None else _retimed(plan, times, capture, powers, planned)
@@ -202,7 +194,7 @@ def _planned(
             )
             if estimate.determined:
                 offset_s, std_s = estimate.time_offset_s, estimate.std_s
-            plan = _with_offset_conflict(plan, profile.time_offset_s, offset_s, std_s, OFFSET_SOURCE)
+            plan = _with_offset_conflict(plan, profile.time_offset_s, offset_s, std_s, POINTS_SOURCE)
     if plan.refusal is not None:
         return plan
     if alignment is not None:
@@ -578,7 +570,7 @@ def _with_estimates(plan: RestorationPlan, imu: ImuSamples, observed: ObservedTr
         return plan.refused(NoteCode.TIME_OFFSET, "time offset not determined: virest calibrate")
     offset_s = estimate.time_offset_s
     profile = plan.profile.with_estimate(
-        "time_offset_s", offset_s, estimate.std_s, "tracked points against the gyroscope", time_offset_s=offset_s
+        "time_offset_s", offset_s, estimate.std_s, POINTS_SOURCE, time_offset_s=offset_s
     )
     profile = _with_bias(profile, estimate)
     plan = replace(plan, profile=profile).noted(NoteCode.TIME_OFFSET, estimated_offset(offset_s, estimate.std_s))
@@ -591,22 +583,32 @@ def _noted_axes(plan: RestorationPlan, given: CameraProfile) -> RestorationPlan:
     """The plan with a note on the axes that are not the default ones."""
     angle = np.degrees(np.linalg.norm(rotation_between(given, plan.profile)))
     text = f"the gyroscope's axes are turned by {angle:.0f}° from the default ones, as tracked points show"
-    return plan.noted(NoteCode.DEFAULT_TAKEN, text)
+    return plan.noted(NoteCode.OTHER_AXES, text)
 
 
-def _with_readout(profile: CameraProfile, shown: CameraProfile) -> CameraProfile:
-    """The profile with another's shutter and its estimate; where the offset is known, the first row keeps its time."""
-    estimate = shown.estimates["readout_time_s"]
-    return profile.with_estimate(
-        "readout_time_s", estimate.value, estimate.std, estimate.source, shutter=shown.shutter, readout_known=True
-    )
+def _with_shown_readout(
+    plan: RestorationPlan, given: CameraProfile, capture: Capture, tracked: Sequence[TrackPair]
+) -> CameraProfile | None:
+    """The given profile with the readout that points show, seen through the plan's lens and clock; None: none shown."""
+    follows = plan.refusal is None or plan.refuses(NoteCode.TIME_OFFSET)
+    if given.readout_known or plan.profile.intrinsics is None or not follows:
+        return None
+    observed = observe_tracks(capture, tracked, plan.profile)
+    known = {"offset_known": given.time_offset_s is not None, "focal_known": given.intrinsics is not None}
+    found = shown_readout(observed, capture.imu, plan.profile, **known)
+    if found is None:
+        return None
+    shutter, std_s = found
+    value, source = shutter.readout_time_s, POINTS_SOURCE
+    return given.with_estimate("readout_time_s", value, std_s, source, shutter=shutter, readout_known=True)
 
 
-def _noted_readout(plan: RestorationPlan, shown: CameraProfile) -> RestorationPlan:
-    estimate = shown.estimates["readout_time_s"]
+def _noted_readout(plan: RestorationPlan) -> RestorationPlan:
+    """The plan with a note on its readout, as estimated."""
+    shutter, estimate = plan.profile.shutter, plan.profile.estimates["readout_time_s"]
     std_ms = 1e3 * float(np.max(np.asarray(estimate.std, float)))
-    readout_ms, direction = 1e3 * shown.shutter.readout_time_s, shown.shutter.readout_direction
-    return plan.noted(NoteCode.READOUT, f"readout time estimated: {readout_ms:.2f} ± {std_ms:.2f} ms, {direction}")
+    text = f"readout time estimated: {1e3 * shutter.readout_time_s:.2f} ± {std_ms:.2f} ms, {shutter.readout_direction}"
+    return plan.noted(NoteCode.READOUT, text)
 
 
 def _with_bias(profile: CameraProfile, estimate: OffsetEstimate) -> CameraProfile:
@@ -614,7 +616,7 @@ def _with_bias(profile: CameraProfile, estimate: OffsetEstimate) -> CameraProfil
     bias, std = np.array(estimate.bias_rad_s), np.array(estimate.bias_std_rad_s)
     if not np.all(np.isfinite(std)) or np.all(np.abs(bias) < 3 * std):
         return profile
-    source = "tracked points against the gyroscope"
+    source = POINTS_SOURCE
     values = tuple(float(b) for b in bias)
     return profile.with_estimate("gyro_bias_rad_s", list(values), std.tolist(), source, gyro_bias_rad_s=values)
 
@@ -628,4 +630,4 @@ def _with_focal(plan: RestorationPlan, estimate: OffsetEstimate) -> RestorationP
     if focal is None or std is None or std > MAX_FOCAL_SPREAD * focal:
         known = "" if focal is None or std is None else f" (about {focal:.0f} ± {std:.0f} px)"
         return plan.refused(NoteCode.FOCAL_LENGTH, FOCAL_UNKNOWN + known)
-    return replace(plan, profile=profile.with_focal(focal, std, "tracked points against the gyroscope"))
+    return replace(plan, profile=profile.with_focal(focal, std, POINTS_SOURCE))

@@ -17,7 +17,7 @@ from virest.restoration.capture import RestorationPlan
 from virest.restoration.plan_notes import NoteCode
 from virest.restoration.profile_conflict import CONTRADICTED, Settled, settle_conflict
 
-OFFSET_SOURCE = "tracked points against the gyroscope"
+POINTS_SOURCE = "tracked points against the gyroscope"
 MAX_OFFSET_STD_S = 0.003
 """Largest usable deviation of an estimated offset, s: beyond it, at a hand's 30 rad/s², the rates, and so the blur
 paths, would be off by 0.1 rad/s."""
@@ -95,8 +95,8 @@ def _with_open_values(plan: RestorationPlan, found: Settled) -> RestorationPlan:
         lens = profile.intrinsics
         assert lens is not None
         lens = lens.scaled_focal(found.focal[0] / lens.fx_px)
-        profile = profile.with_estimate("fx_px", *found.focal, OFFSET_SOURCE, intrinsics=lens)
-    profile = profile.with_estimate("time_offset_s", offset_s, std_s, OFFSET_SOURCE, time_offset_s=offset_s)
+        profile = profile.with_estimate("fx_px", *found.focal, POINTS_SOURCE, intrinsics=lens)
+    profile = profile.with_estimate("time_offset_s", offset_s, std_s, POINTS_SOURCE, time_offset_s=offset_s)
     plan = replace(plan.without(NoteCode.TIME_OFFSET), profile=profile, refusal=None)
     if std_s > MAX_OFFSET_STD_S:
         plan = plan.refused(NoteCode.TIME_OFFSET, f"time offset only known to ± {std_s * 1e3:.1f} ms")
